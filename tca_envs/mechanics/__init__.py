@@ -1,0 +1,7 @@
+"""Physics of the arm: muscles, modules, equilibrium, heating. Knows no Gymnasium."""
+
+from tca_envs.mechanics.arm import Arm, Grid, Module, Payload
+from tca_envs.mechanics.equilibrium import Equilibrium
+from tca_envs.mechanics.muscle import TCA, Muscle, Spring, Tendon
+
+__all__ = ["TCA", "Arm", "Equilibrium", "Grid", "Module", "Muscle", "Payload", "Spring", "Tendon"]

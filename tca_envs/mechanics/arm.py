@@ -1,0 +1,542 @@
+"""The arm as data: muscles in modules, modules in series, what hangs from the tip; and its equilibrium."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import ceil, hypot
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tca_envs.mechanics import check, section
+from tca_envs.mechanics.collocation import (
+    FAILED,
+    FALL,
+    LOAD,
+    SUBSTEPS,
+    Model,
+    shape,
+    solve_lanes,
+    tip_jacobian,
+)
+from tca_envs.mechanics.equilibrium import Equilibrium
+from tca_envs.mechanics.muscle import PARAMETERS, Muscle
+
+Array = NDArray[np.float64]
+ArrayOf3 = tuple[float, float, float]
+ZERO: ArrayOf3 = (0.0, 0.0, 0.0)
+STRAIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Module:
+    """A soft rod with muscles in it.
+
+    Parameters
+    ----------
+    length : float
+        Length of the unloaded centerline [m].
+    stiffness : (6,) array
+        Diagonal of K: EI_x, EI_y, GJ [N m2], GA, GA, EA [N], eq. (3).
+    mass_per_length : float
+        [kg/m].
+    muscles : sequence of Muscle
+        Each runs from the module's base to its end.
+    reference_strain : (6,) array
+        xi* = [u*; v*], uniform: strain of the unloaded rod [1/m, 1].
+
+    Raises
+    ------
+    ValueError
+        For a non-positive length or stiffness, a negative mass, non-finite numbers, wrong shapes, or a muscle whose path
+        shrinks to a point in the unloaded rod.
+    """
+
+    length: float
+    stiffness: Array
+    mass_per_length: float = 0.0
+    muscles: Sequence[Muscle] = ()
+    reference_strain: Array = field(default_factory=lambda: np.array(STRAIGHT))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "length", check.scalar("length", self.length, 0.0, above=True))
+        stiffness = check.array("stiffness", self.stiffness, (6,))
+        if not (stiffness > 0.0).all():
+            raise ValueError(
+                f"stiffness = {self.stiffness!r}: expected six positive numbers EI_x, EI_y, GJ, GA, GA, EA"
+            )
+        reference = check.array("reference_strain", self.reference_strain, (6,))
+        if not reference[5] > 0.0:
+            raise ValueError(
+                f"reference_strain = {self.reference_strain!r}: expected v*_z > 0, the rod's own direction"
+            )
+        object.__setattr__(
+            self, "mass_per_length", check.scalar("mass_per_length", self.mass_per_length, 0.0)
+        )
+        try:
+            muscles = tuple(self.muscles)
+        except TypeError:
+            raise ValueError(f"muscles = {self.muscles!r}: expected a sequence of Muscle") from None
+        for i, muscle in enumerate(muscles):
+            if not isinstance(muscle, Muscle):
+                raise ValueError(f"muscles[{i}] = {muscle!r}: expected a Muscle")
+        for values in (stiffness, reference):
+            values.setflags(write=False)
+        object.__setattr__(self, "stiffness", stiffness)
+        object.__setattr__(self, "reference_strain", reference)
+        object.__setattr__(self, "muscles", muscles)
+        fractions = np.linspace(0.0, 1.0, 181)
+        for i, muscle in enumerate(muscles):
+            shortest = min(self._stretch(muscle, x) for x in fractions)
+            if not shortest > 1e-3:
+                raise ValueError(
+                    f"muscles[{i}] = {muscle!r}: expected a path that runs along the module; with reference_strain "
+                    f"{reference.tolist()} it shrinks to {shortest:.3g} m per metre of centerline"
+                )
+
+    @classmethod
+    def cylinder(
+        cls,
+        length: float,
+        diameter: float,
+        youngs_modulus: float,
+        shear_modulus: float,
+        mass: float = 0.0,
+        muscles: Sequence[Muscle] = (),
+        curvature: ArrayOf3 = ZERO,
+    ) -> "Module":
+        """Return a module of round section: EI = E pi d^4/64, GJ = G pi d^4/32, GA, EA with A = pi d^2/4.
+
+        Parameters
+        ----------
+        length, diameter : float
+            [m].
+        youngs_modulus, shear_modulus : float
+            [Pa].
+        mass : float
+            Of the whole module [kg].
+        muscles : sequence of Muscle
+            Each runs from the module's base to its end.
+        curvature : (3,) array
+            u* [1/m]: curvature of the unloaded rod about x, y and its twist.
+        """
+        length = check.scalar("length", length, 0.0, above=True)
+        diameter = check.scalar("diameter", diameter, 0.0, above=True)
+        e = check.scalar("youngs_modulus", youngs_modulus, 0.0, above=True)
+        g = check.scalar("shear_modulus", shear_modulus, 0.0, above=True)
+        mass = check.scalar("mass", mass, 0.0)
+        u = check.array("curvature", curvature, (3,))
+        area, inertia = np.pi * diameter**2 / 4.0, np.pi * diameter**4 / 64.0
+        stiffness = np.array([e * inertia, e * inertia, 2.0 * g * inertia, g * area, g * area, e * area])
+        return cls(length, stiffness, mass / length, muscles, np.array([*u, 0.0, 0.0, 1.0]))
+
+    def route(self, muscle: Muscle, fraction: float) -> Array:
+        """Return x, y [m] of a muscle in the cross section and their derivatives in s, at s = fraction * length; (4,)."""
+        rate = 2.0 * np.pi * muscle.turns / self.length
+        angle = muscle.angle + rate * self.length * fraction
+        x, y = muscle.offset * np.cos(angle), muscle.offset * np.sin(angle)
+        return np.array([x, y, -rate * y, rate * x])
+
+    def _stretch(self, muscle: Muscle, fraction: float) -> float:
+        """Return |p_a'| of the unloaded rod, eq. (13)."""
+        x, y, dx, dy = self.route(muscle, fraction)
+        u, v = self.reference_strain[:3], self.reference_strain[3:]
+        return float(np.linalg.norm([v[0] - u[2] * y + dx, v[1] + u[2] * x + dy, v[2] + u[0] * y - u[1] * x]))
+
+    def rest_length(self, muscle: Muscle, nodes: int = 64) -> float:
+        """Return the path length of a muscle in the unloaded rod [m], l* of eq. (24), by Gauss quadrature."""
+        _, weights, points = gauss(nodes)
+        return self.length * float(
+            sum(w * self._stretch(muscle, x) for w, x in zip(weights, points, strict=True))
+        )
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A rigid body that hangs from the tip.
+
+    Parameters
+    ----------
+    mass : float
+        [kg].
+    centre : (3,) tuple
+        Its centre of mass in the frame of the arm's last cross section [m].
+    """
+
+    mass: float
+    centre: ArrayOf3 = ZERO
+
+    def __post_init__(self) -> None:
+        check.scalar("mass", self.mass, 0.0)
+        check.array("centre", self.centre, (3,))
+
+
+class Grid(NamedTuple):
+    """How a module is discretised: `elements` of equal length with `nodes` Gauss nodes each."""
+
+    elements: int
+    nodes: int
+
+
+MAX_NODES = 16
+
+
+def gauss(nodes: int) -> tuple[Array, Array, Array]:
+    """Return the Gauss collocation coefficients a (q, q), weights b (q,) and nodes c (q,) on [0, 1]."""
+    x, w = np.polynomial.legendre.leggauss(nodes)
+    return integrals((x + 1.0) / 2.0, (x + 1.0) / 2.0), w / 2.0, (x + 1.0) / 2.0
+
+
+def integrals(c: Array, x: Array) -> Array:
+    """Return A (len(x), q): integrals from 0 to x of the Lagrange polynomials on the nodes c in [0, 1]."""
+    q = len(c)
+    legendre = np.polynomial.legendre
+    vandermonde = legendre.legvander(2.0 * c - 1.0, q - 1)
+    columns = [
+        legendre.legval(2.0 * x - 1.0, legendre.legint(np.eye(q)[k], lbnd=-1.0)) / 2.0 for k in range(q)
+    ]
+    return np.linalg.solve(vandermonde.T, np.array(columns)).T
+
+
+def default_grid(module: Module) -> Grid:
+    """Return a grid that resolves a muscle-driven or moderately loaded module to below 1e-6 of its length.
+
+    Helical muscles turn the local strain, so an element spans at most half a turn; a curved reference at most two radians.
+    """
+    turns = max((abs(muscle.turns) for muscle in module.muscles), default=0.0)
+    bend = module.length * float(np.linalg.norm(module.reference_strain[:3]))
+    return Grid(max(2, ceil(2.0 * turns), ceil(bend / 2.0)), 5 if turns > 1.0 else 8)
+
+
+class Arm:
+    """Soft modules in series, base at the origin, z along the unloaded arm.
+
+    Parameters
+    ----------
+    modules : sequence of Module
+        Base to tip.
+    gravity : (3,) array
+        Gravitational acceleration in the base frame [m/s2]; (0, 0, 9.81) hangs the arm.
+    payload : Payload, optional
+        A rigid body that hangs from the tip.
+    grids : sequence of Grid, optional
+        Discretisation, one for each module; by default `default_grid`.
+    tolerance : float
+        Newton stops when `Equilibrium.residual` is below it. Convergence is quadratic, so the last step usually goes far
+        beyond: with 1e-6 the tip is solved to nanometres.
+
+    Raises
+    ------
+    ValueError
+        If there is no module or an argument is not of its kind.
+    """
+
+    def __init__(
+        self,
+        modules: Sequence[Module],
+        gravity: ArrayLike = ZERO,
+        payload: Payload | None = None,
+        grids: Sequence[Grid] | None = None,
+        tolerance: float = 1e-9,
+    ) -> None:
+        try:
+            self.modules = tuple(modules)
+        except TypeError:
+            raise ValueError(f"modules = {modules!r}: expected a sequence of Module") from None
+        if not self.modules or not all(isinstance(module, Module) for module in self.modules):
+            raise ValueError(f"modules = {modules!r}: expected at least one Module and nothing else")
+        self.gravity = check.array("gravity", gravity, (3,))
+        if payload is not None and not isinstance(payload, Payload):
+            raise ValueError(f"payload = {payload!r}: expected a Payload or None")
+        self.payload = payload
+        self.grids = (
+            tuple(default_grid(m) for m in self.modules)
+            if grids is None
+            else _checked(grids, len(self.modules))
+        )
+        self.tolerance = check.scalar("tolerance", tolerance, 1e-12, 1e-3)
+        self.length = sum(module.length for module in self.modules)
+        self.muscles = tuple(muscle for module in self.modules for muscle in module.muscles)
+        self.model, self.node_arc = _compile(self.modules, self.grids, self.tolerance)
+        ranges = np.array([muscle.law.drive_range() for muscle in self.muscles]).reshape(-1, 2)
+        self._lowest, self._highest = ranges.T.copy()
+        self._neutral = np.array(
+            [m.law.neutral_drive(rest) for m, rest in zip(self.muscles, self.model.rest_length, strict=True)]
+        )
+        self._load = np.zeros(LOAD)
+        self._load[6:9] = self.gravity
+        if payload is not None:
+            self._load[9:] = (payload.mass, *payload.centre)
+        per_module = [grid.elements * grid.nodes for grid in self.grids]
+        self._unloaded_strain = np.repeat(self.model.reference, per_module, axis=0)
+
+    @property
+    def rest_lengths(self) -> Array:
+        """Path lengths of the muscles in the unloaded arm (n,) [m]."""
+        return self.model.rest_length.copy()
+
+    def load(self, tip_force: ArrayLike = ZERO, tip_moment: ArrayLike = ZERO) -> Array:
+        """Return the external load as the flat array of `collocation.LOAD` numbers that the kernels read."""
+        load = self._load.copy()
+        load[0:3] = _vector("tip_force", tip_force)
+        load[3:6] = _vector("tip_moment", tip_moment)
+        return load
+
+    def unloaded(self) -> tuple[Array, Array, Array, Array]:
+        """Return strain (G, 6), tension (n,), drive (n,) and load of the unloaded arm: where every cold start begins."""
+        return self._unloaded_strain.copy(), np.zeros(len(self.muscles)), self._neutral.copy(), np.zeros(LOAD)
+
+    def equilibrium(
+        self,
+        drive: ArrayLike,
+        tip_force: ArrayLike = ZERO,
+        tip_moment: ArrayLike = ZERO,
+        start: Equilibrium | None = None,
+    ) -> Equilibrium:
+        """Find the equilibrium that continues `start`, or the unloaded arm.
+
+        Parameters
+        ----------
+        drive : (n,) array
+            Temperature [degC] of a TCA, tension [N] of a tendon, rest length [m] of a spring; modules base to tip.
+        tip_force, tip_moment : (3,) arrays
+            Load on the last centroid in the base frame [N], [N m].
+        start : Equilibrium, optional
+            An earlier equilibrium of this arm: a warm start.
+
+        Returns
+        -------
+        Equilibrium
+            With `converged` False, and the start's shape, where none was found.
+
+        Raises
+        ------
+        ValueError
+            For a wrong shape, non-finite numbers, a drive outside its law's range or a start of another arm.
+
+        Notes
+        -----
+        Gauss collocation of the strain with damped Newton, then substeps in drive and load, then a damped fall; see
+        `collocation`.
+        """
+        drive = self.checked_drive(drive)
+        load = self.load(tip_force, tip_moment)
+        if start is None:
+            strain, tension, from_drive, from_load = self.unloaded()
+        else:
+            strain, tension, from_drive, from_load = self._restart(start)
+        tip, lengths, report = np.empty((1, 7)), np.empty((1, drive.size)), np.empty((1, 3))
+        lanes = [values[np.newaxis] for values in (strain, tension, from_drive, from_load, drive, load)]
+        solve_lanes(self.model, *lanes, tip, lengths, report)
+        rung, residual, iterations = report[0].tolist()
+        converged = rung != FAILED
+        if converged:
+            message = f"converged below {self.tolerance:g}" + (
+                " in substeps of drive and load" if rung == SUBSTEPS else ""
+            )
+        else:
+            message = (
+                "no equilibrium found by Newton or by substeps in drive and load; this is the start's shape"
+            )
+            ends, _, position, _, _, lengths[0] = shape(self.model, strain, tension, from_drive, from_load)
+            tip[0, :4], tip[0, 4:] = ends[-1], position[-1]
+        # Where there is no answer, from_drive and from_load still are the start's.
+        state = (strain, tension, from_drive, from_load)
+        return Equilibrium(
+            tip_pose=pose(tip[0, :4], tip[0, 4:]),
+            tensions=tension,
+            muscle_lengths=lengths[0],
+            drive=drive,
+            converged=converged,
+            residual=residual,
+            iterations=int(iterations),
+            message=message,
+            length=self.length,
+            load=load,
+            sample=_Sampler(self, *state),
+            differentiate=_Differentiator(self, *state),
+            nodes=(self.model, strain),
+        )
+
+    def checked_drive(self, drive: ArrayLike) -> Array:
+        """Return `drive` as (n,) floats; ValueError for a wrong shape, non-finite numbers or values out of a law's range."""
+        result = check.array("drive", drive, (len(self.muscles),))
+        outside = (result < self._lowest) | (result > self._highest)
+        if outside.any():
+            i = int(np.argmax(outside))
+            raise ValueError(
+                f"drive[{i}] = {result[i]:g}: expected a value in [{self._lowest[i]:g}, {self._highest[i]:g}] for "
+                f"{type(self.muscles[i].law).__name__}"
+            )
+        return result
+
+    def _restart(self, start: Equilibrium) -> tuple[Array, Array, Array, Array]:
+        if not isinstance(start, Equilibrium):
+            raise ValueError(f"start = {start!r}: expected an Equilibrium or None")
+        if (
+            start.tensions.shape != (len(self.muscles),)
+            or abs(start.length - self.length) > 1e-9 * self.length
+        ):
+            raise ValueError(
+                f"start has {start.tensions.size} muscles and length {start.length:g} m: expected an equilibrium of this "
+                f"arm, with {len(self.muscles)} and {self.length:g} m"
+            )
+        # A failed solve holds the shape of its own start, so that is where the substeps begin.
+        source = start.sample if isinstance(start.sample, _Sampler) else None
+        from_drive, from_load = (source.drive, source.load) if source else (start.drive, start.load)
+        if start.nodes is not None and start.nodes[0] is self.model:
+            strain = start.nodes[1].copy()
+        else:
+            strain = start.strain(self.node_arc)
+        return strain, start.tensions.copy(), from_drive.copy(), from_load.copy()
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampler:
+    """Shape between the nodes: collocation polynomials for pose and moment, section balance for the strain."""
+
+    arm: Arm
+    strain: Array
+    tension: Array
+    drive: Array
+    load: Array
+
+    def __call__(self, s: Array) -> tuple[Array, Array]:
+        arm, model = self.arm, self.arm.model
+        ends, quaternion, position, tangent, spin, _ = shape(
+            model, self.strain, self.tension.copy(), self.drive, self.load
+        )
+        rotation = pose(ends[-1], position[-1])[:3, :3]
+        force_tip = self.load[0:3] + self.load[9] * self.load[6:9]
+        moment = self.load[3:6] + np.cross(rotation @ self.load[10:13], self.load[9] * self.load[6:9])
+        poses, strains = np.empty((s.size, 4, 4)), np.empty((s.size, 6))
+        start, e, g, mass = arm.length, len(ends) - 1, len(self.strain), 0.0
+        for k in range(len(arm.modules) - 1, -1, -1):
+            module, (elements, q) = arm.modules[k], arm.grids[k]
+            _, b, c = gauss(q)
+            h = module.length / elements
+            muscles = slice(model.first_muscle[k], model.first_muscle[k + 1])
+            base = start - module.length
+            for piece in range(elements - 1, -1, -1):
+                e, g = e - 1, g - q
+                low, high = base + piece * h, base + (piece + 1) * h
+                inside = (s >= low - 1e-15) & ((s < high - 1e-15) | (e == len(ends) - 2))
+                x = (s[inside] - low) / h
+                coefficients = h * integrals(c, x)
+                rate = np.array([_half_product(quaternion[g + j], self.strain[g + j, :3]) for j in range(q)])
+                for index, a, here in zip(np.flatnonzero(inside), coefficients, x, strict=True):
+                    frame = pose(ends[e] + a @ rate, position[e] + a @ tangent[g : g + q])
+                    r = frame[:3, :3]
+                    below = mass + module.mass_per_length * h * (1.0 - here)
+                    wrench = np.concatenate(
+                        [
+                            r.T @ (moment + (h * b - a) @ spin[g : g + q]),
+                            r.T @ (force_tip + below * self.load[6:9]),
+                        ]
+                    )
+                    fraction = (piece + here) / elements
+                    route = np.array([module.route(m, fraction) for m in module.muscles]).reshape(-1, 4)
+                    nearest = self.strain[g + int(np.argmin(np.abs(c - here)))]
+                    poses[index] = frame
+                    strains[index] = section.solve(
+                        module.stiffness,
+                        module.reference_strain,
+                        route,
+                        self.tension[muscles],
+                        wrench,
+                        nearest,
+                    )
+                moment = moment + h * b @ spin[g : g + q]
+                mass += module.mass_per_length * h
+            start = base
+        return poses, strains
+
+
+@dataclass(frozen=True, eq=False)
+class _Differentiator:
+    arm: Arm
+    strain: Array
+    tension: Array
+    drive: Array
+    load: Array
+
+    def __call__(self) -> Array:
+        return tip_jacobian(self.arm.model, self.strain, self.tension.copy(), self.drive, self.load)
+
+
+def pose(quaternion: Array, position: Array) -> Array:
+    """Return the (4, 4) pose of a quaternion (w, x, y, z) of any norm and a position (3,)."""
+    w, x, y, z = quaternion / hypot(*quaternion)
+    result = np.eye(4)
+    result[:3, :3] = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    result[:3, 3] = position
+    return result
+
+
+def _half_product(q: Array, u: Array) -> Array:
+    """Return (q o [0, u])/2, eq. (28)."""
+    (w, x, y, z), (a, b, c) = q, u
+    return 0.5 * np.array(
+        [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
+    )
+
+
+def _vector(name: str, value: ArrayLike) -> ArrayLike:
+    return ZERO if value is ZERO else check.array(name, value, (3,))
+
+
+def _checked(grids: Sequence[Grid], modules: int) -> tuple[Grid, ...]:
+    try:
+        result = tuple(Grid(*(int(n) for n in grid)) for grid in grids)
+    except TypeError:
+        raise ValueError(f"grids = {grids!r}: expected one Grid(elements, nodes) for each module") from None
+    if len(result) != modules or any(g.elements < 1 or not 1 <= g.nodes <= MAX_NODES for g in result):
+        raise ValueError(
+            f"grids = {grids!r}: expected {modules} of Grid(elements >= 1, nodes in 1..{MAX_NODES}), one for each module"
+        )
+    return result
+
+
+def _compile(modules: tuple[Module, ...], grids: tuple[Grid, ...], tolerance: float) -> tuple[Model, Array]:
+    """Return the arm as plain arrays for the kernels, and the arc positions of its nodes (G,) [m]."""
+    most_nodes = max(grid.nodes for grid in grids)
+    most_muscles = max(len(module.muscles) for module in modules)
+    a, b = np.zeros((len(modules), most_nodes, most_nodes)), np.zeros((len(modules), most_nodes))
+    routes: list[Array] = []
+    mass_below: list[float] = []
+    arc: list[float] = []
+    base = 0.0
+    for k, (module, (elements, q)) in enumerate(zip(modules, grids, strict=True)):
+        a[k, :q, :q], b[k, :q], c = gauss(q)
+        beyond = sum(m.mass_per_length * m.length for m in modules[k + 1 :])
+        for piece in range(elements):
+            for x in (piece + c) / elements:
+                route = np.zeros((most_muscles, 4))
+                for i, muscle in enumerate(module.muscles):
+                    route[i] = module.route(muscle, x)
+                routes.append(route)
+                mass_below.append(beyond + module.mass_per_length * module.length * (1.0 - x))
+                arc.append(base + x * module.length)
+        base += module.length
+    muscles = [(module, muscle) for module in modules for muscle in module.muscles]
+    model = Model(
+        elements=np.array([grid.elements for grid in grids], dtype=np.int64),
+        nodes=np.array([grid.nodes for grid in grids], dtype=np.int64),
+        length=np.array([module.length for module in modules]),
+        a=a,
+        b=b,
+        stiffness=np.array([module.stiffness for module in modules]),
+        reference=np.array([module.reference_strain for module in modules]),
+        first_muscle=np.cumsum([0] + [len(module.muscles) for module in modules]).astype(np.int64),
+        route=np.array(routes),
+        mass_below=np.array(mass_below),
+        kind=np.array([muscle.law.kind for _, muscle in muscles], dtype=np.int64),
+        parameters=np.array([muscle.law.parameters() for _, muscle in muscles]).reshape(-1, PARAMETERS),
+        rest_length=np.array([module.rest_length(muscle) for module, muscle in muscles]),
+        tolerance=tolerance,
+    )
+    return model, np.array(arc)

@@ -1,0 +1,39 @@
+"""Checks of arguments: each refuses with a message that names the argument, its value and what was expected."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def scalar(name: str, value: Any, low: float = -np.inf, high: float = np.inf, above: bool = False) -> float:
+    """Return `value` as a finite float within [low, high], or (low, high] if `above`; ValueError otherwise."""
+    interval = f"{'(' if above else '['}{low:g}, {high:g}]"
+    expected = "a finite number" if low == -np.inf and high == np.inf else f"a finite number in {interval}"
+    if not isinstance(value, int | float | np.integer | np.floating) or isinstance(value, bool):
+        raise ValueError(f"{name} = {value!r}: expected {expected}")
+    number = float(value)
+    if not np.isfinite(number) or number < low or number > high or (above and number == low):
+        raise ValueError(f"{name} = {value!r}: expected {expected}")
+    return number
+
+
+def array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
+    """Return a float64 copy of `value`, finite and of `shape` (None: any size); ValueError otherwise."""
+    expected = (
+        "("
+        + ", ".join("any" if n is None else str(n) for n in shape)
+        + ("," if len(shape) == 1 else "")
+        + ")"
+    )
+    try:
+        result = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} = {value!r}: expected finite numbers of shape {expected}") from None
+    if result.ndim != len(shape) or any(
+        n is not None and n != m for n, m in zip(shape, result.shape, strict=True)
+    ):
+        raise ValueError(f"{name} = {value!r} has shape {result.shape}: expected shape {expected}")
+    if not np.isfinite(result).all():
+        raise ValueError(f"{name} = {value!r}: expected finite numbers")
+    return result

@@ -1,0 +1,820 @@
+"""Compiled kernels: the equilibrium of an arm by Gauss collocation of the strain.
+
+Each module is cut into elements, each element carries q Gauss nodes, the unknowns are the strain at every node and the
+muscles' tensions. A muscle is internal to the arm, so the total internal wrench (rod + muscles) feels external loads only:
+
+* the total force n(s) in the global frame is known beforehand: tip force + weight below s;
+* the rotation follows from the strain (R' = R u^, collocated on quaternions), the moment from m' = -p' x n;
+* at a node the strain balances K (xi - xi*) + sum_i F_i [r x t; t] = R^T [m; n]: no derivative of the strain appears, and
+  no rule for joints, because the total wrench is continuous across them (erratum of eq. (26));
+* one equation per muscle: path length - rest length = elongation(tension, drive), eq. (24).
+
+Newton's tangent comes from continuous variations in the global frame: with w = R du, phi' = w, dp' = phi x p' + R dv,
+dm' = -dp' x n. Eliminating dv at the nodes leaves 3 q unknowns w in an element; elements are eliminated from the tip to the
+base, each handing on dm = P phi + Q dF + p at its base end (a Riccati recursion: linear cost in the number of elements,
+stable for any length), and the tensions of a module are eliminated at its base. Gauss weights make this tangent that of
+the discrete equations up to the discretisation error.
+
+Indices: k module, e element, j node of an element, g node of the arm, i muscle of the arm, c muscle of the module.
+Loads are one flat array, see `LOAD`. All matrices are small, so loops are written out: they beat library calls here.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tca_envs.mechanics.algebra import (
+    apply,
+    apply_transposed,
+    axpy,
+    axpy9,
+    cross,
+    cross_matrix,
+    dot,
+    entry,
+    get3,
+    get4,
+    get9,
+    inner,
+    inverse,
+    matmul,
+    outer,
+    put3,
+    put4,
+    put9,
+    quaternion_rate,
+    quaternion_turn,
+    rotation_matrix,
+    scalar_matrix,
+    transpose,
+)
+from tca_envs.mechanics.muscle import TENDON, elongation
+
+Array = NDArray[np.float64]
+
+# A load is (13,): tip force [N] and tip moment [N m] in the global frame, gravity [m/s2],
+# payload mass [kg] and its centre in the tip's frame [m].
+LOAD = 13
+FORCE, MOMENT, GRAVITY, PAYLOAD_MASS, PAYLOAD_CENTRE = 0, 3, 6, 9, 10
+
+MAX_ITERATIONS = 30
+MAX_FALL = 400
+MAX_ROTATION_STEP = 1.0  # rad: beyond it the linearised rotation is no guide
+MAX_SHEAR_STEP = 0.5
+SWEEPS = 60
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+class Model(NamedTuple):
+    """An arm as plain arrays. M modules, n muscles, G nodes, q <= Q nodes per element, at most m muscles in a module."""
+
+    elements: NDArray[np.int64]  # (M,) elements of each module
+    nodes: NDArray[np.int64]  # (M,) nodes per element
+    length: Array  # (M,) [m]
+    a: Array  # (M, Q, Q) Gauss coefficients a_jk on [0, 1]
+    b: Array  # (M, Q) Gauss weights
+    stiffness: Array  # (M, 6) diagonal of K
+    reference: Array  # (M, 6) xi*
+    first_muscle: NDArray[np.int64]  # (M + 1,)
+    route: Array  # (G, m, 4) muscle position x, y [m] and its derivative in s
+    mass_below: Array  # (G,) mass of the arm beyond each node [kg]
+    kind: NDArray[np.int64]  # (n,) kind of muscle law
+    parameters: Array  # (n, PARAMETERS) of muscle law
+    rest_length: Array  # (n,) [m]
+    tolerance: float  # Newton stops when the dimensionless residual is below this (see `evaluate`)
+
+
+class Workspace(NamedTuple):
+    """Scratch of one solve: filled by `evaluate`, `eliminate` and `substitute`; E elements in all."""
+
+    rate: Array  # (Q, 4) h o u h/2 at the nodes of an element
+    quaternion: Array  # (G, 4)
+    ends: Array  # (E + 1, 4) quaternions at the element ends
+    position: Array  # (E + 1, 3) at the element ends [m]
+    rotation: Array  # (G, 9)
+    tangent: Array  # (G, 3) p' in the global frame
+    force: Array  # (G, 3) total force n, body frame
+    moment: Array  # (G, 3) total moment m, global frame
+    spin: Array  # (G, 3) p' x n, global frame
+    path: Array  # (G, 4 m) t and |p'| of each muscle
+    residual: Array  # (G, 6) section balance
+    length: Array  # (n,) path lengths [m]
+    gap: Array  # (n,) compatibility, [m] ([N] for a tendon)
+    softness: Array  # (n,) d elongation/d tension
+    compliance: Array  # (G, 9) inverse of H_vv
+    slide: Array  # (G, 9) H_vv^-1 H_vu
+    wrench: Array  # (G, 6 m) [r x t; t]
+    m_block: Array  # (G, 9) M, global frame, as the next five
+    n_block: Array  # (G, 9) N
+    x_block: Array  # (G, 9) X
+    y_block: Array  # (G, 9) Y
+    pull: Array  # (G, 3 m) e
+    swing: Array  # (G, 3 m) z
+    matrix: Array  # (G Q, 9) rows g Q + l: block of node l in the balance of node g, then its factors
+    phi: Array  # (G, 9) w from the rotation at the element's base
+    pulled: Array  # (G, 3 m) w from dF
+    base: Array  # (G, 9) moment at the element's base from w
+    stretch: Array  # (G, 3 m) path lengths from w
+    handed: Array  # (4 m, 3) Q and its successor, alpha and its successor
+    beta: Array  # (m, m)
+    muscle_matrix: Array  # (M, m, m) factors
+    muscle_phi: Array  # (M, m, 3)
+    muscle_moment: Array  # (M, m, 3)
+    gamma: Array  # (m,)
+    sources: Array  # (Q, 6) rho and zeta of the nodes of an element
+    answer: Array  # (G, 3) w
+    turned: Array  # (G, 3) rotation of each node
+    bend: Array  # (G, 3) du, body frame
+    shear: Array  # (G, 3) dv, body frame
+    tension: Array  # (n,) dF
+    tip: Array  # (6,) d(tip position, tip rotation)
+
+
+@inner
+def workspace(model):
+    """Return a `Workspace` for `model`."""
+    big_e, big_g = np.sum(model.elements), model.mass_below.size
+    q, m, n, modules = model.b.shape[1], model.route.shape[1], model.kind.size, model.length.size
+    return Workspace(
+        np.empty((q, 4)), np.empty((big_g, 4)), np.empty((big_e + 1, 4)), np.empty((big_e + 1, 3)),
+        np.empty((big_g, 9)), np.empty((big_g, 3)), np.empty((big_g, 3)), np.empty((big_g, 3)),
+        np.empty((big_g, 3)), np.empty((big_g, 4 * m)), np.empty((big_g, 6)), np.empty(n), np.empty(n), np.empty(n),
+        np.empty((big_g, 9)), np.empty((big_g, 9)), np.empty((big_g, 6 * m)), np.empty((big_g, 9)),
+        np.empty((big_g, 9)), np.empty((big_g, 9)), np.empty((big_g, 9)), np.empty((big_g, 3 * m)),
+        np.empty((big_g, 3 * m)), np.empty((big_g * q, 9)), np.empty((big_g, 9)), np.empty((big_g, 3 * m)),
+        np.empty((big_g, 9)), np.empty((big_g, 3 * m)), np.empty((4 * m, 3)), np.empty((m, m)),
+        np.empty((modules, m, m)), np.empty((modules, m, 3)), np.empty((modules, m, 3)), np.empty(m), np.empty((q, 6)),
+        np.empty((big_g, 3)), np.empty((big_g, 3)), np.empty((big_g, 3)), np.empty((big_g, 3)), np.empty(n), np.empty(6),
+    )  # fmt: skip
+
+
+@inner
+def _turn(e, g0, k, q, h, model, strain, guessed, ws):
+    """Collocate the quaternion over element e, eq. (28); False where the nodes cannot resolve the rotation.
+
+    Gauss-Seidel sweeps of h_j = h_0 + h sum_k a_jk (h_k o u_k)/2, a linear problem whose sweeps contract by about |u| h/4q,
+    from the quaternions in `ws` if they are `guessed` and otherwise from the exponential of the mean curvature.
+    """
+    a, quaternion, rate = model.a, ws.quaternion, ws.rate
+    q0 = get4(ws.ends, e)
+    half = 0.5 * h
+    for j in range(q):
+        if not guessed:
+            x = ORIGIN
+            for l in range(q):
+                x = axpy(half * a[k, j, l], get3(strain, g0 + l, 0), x)
+            angle = np.sqrt(dot(x, x))
+            c, s = np.cos(angle), (np.sin(angle) / angle if angle > 1e-8 else 1.0)
+            d = quaternion_rate(q0, x)
+            put4(
+                quaternion,
+                g0 + j,
+                (c * q0[0] + s * d[0], c * q0[1] + s * d[1], c * q0[2] + s * d[2], c * q0[3] + s * d[3]),
+            )
+        old = get4(quaternion, g0 + j)
+        put4(rate, j, quaternion_rate(old, axpy(half, get3(strain, g0 + j, 0), ORIGIN)))
+    settled = False
+    for _ in range(SWEEPS):
+        change = 0.0
+        for j in range(q):
+            h0, h1, h2, h3 = q0
+            for l in range(q):
+                c = a[k, j, l]
+                h0 += c * rate[l, 0]
+                h1 += c * rate[l, 1]
+                h2 += c * rate[l, 2]
+                h3 += c * rate[l, 3]
+            old = get4(quaternion, g0 + j)
+            new = (h0, h1, h2, h3)
+            change = max(change, abs(h0 - old[0]), abs(h1 - old[1]), abs(h2 - old[2]), abs(h3 - old[3]))
+            put4(quaternion, g0 + j, new)
+            put4(rate, j, quaternion_rate(new, axpy(half, get3(strain, g0 + j, 0), ORIGIN)))
+        if change < 1e-14:
+            settled = True
+            break
+        if not change < 1e6:
+            return False
+    h0, h1, h2, h3 = q0
+    for l in range(q):
+        c = model.b[k, l]
+        h0 += c * rate[l, 0]
+        h1 += c * rate[l, 1]
+        h2 += c * rate[l, 2]
+        h3 += c * rate[l, 3]
+    s = 1.0 / np.sqrt(h0 * h0 + h1 * h1 + h2 * h2 + h3 * h3)
+    put4(ws.ends, e + 1, (s * h0, s * h1, s * h2, s * h3))
+    return settled
+
+
+@inner
+def evaluate(model, strain, tension, drive, load, guessed, ws):
+    """Evaluate the equilibrium equations at a state.
+
+    Parameters
+    ----------
+    model : Model
+        The arm.
+    strain : (G, 6) array
+        Strain xi = [u; v] at the nodes, body frame.
+    tension : (n,) array
+        Tensions [N]; those of tendons are set to their drives.
+    drive : (n,) array
+        Drives.
+    load : (LOAD,) array
+        External load.
+    guessed : bool
+        Whether `ws` holds quaternions near those of this state.
+    ws : Workspace
+        Receives rotations, wrenches and residuals.
+
+    Returns
+    -------
+    tuple of float
+        The dimensionless residual: the largest of |moment imbalance| L/K (an angle over the module), |force imbalance|/K (a
+        strain) and |length mismatch|/rest length; and the sum of squares of all of them. Both inf where the state is
+        no configuration (a rotation that the nodes cannot resolve, a muscle path that shrinks to a point).
+    """
+    a, b, elements, nodes, first_muscle = model.a, model.b, model.elements, model.nodes, model.first_muscle
+    ends, position, rotation, tangent, spin = ws.ends, ws.position, ws.rotation, ws.tangent, ws.spin
+    path, residual, length, route = ws.path, ws.residual, ws.length, model.route
+    worst, total = 0.0, 0.0
+    gravity = (load[6], load[7], load[8])
+    mass = load[PAYLOAD_MASS]
+    # Base to tip: rotations, tangents, forces.
+    put4(ends, 0, (1.0, 0.0, 0.0, 0.0))
+    p = ORIGIN
+    put3(position, 0, 0, p)
+    g0 = e = 0
+    for k in range(elements.size):
+        q, h = nodes[k], model.length[k] / elements[k]
+        for _ in range(elements[k]):
+            if not _turn(e, g0, k, q, h, model, strain, guessed, ws):
+                return np.inf, np.inf
+            for j in range(q):
+                g = g0 + j
+                r = rotation_matrix(get4(ws.quaternion, g))
+                t = apply(r, get3(strain, g, 3))
+                n = axpy(mass + model.mass_below[g], gravity, (load[0], load[1], load[2]))
+                p = axpy(h * b[k, j], t, p)
+                put9(rotation, g, r)
+                put3(tangent, g, 0, t)
+                put3(ws.force, g, 0, apply_transposed(r, n))
+                put3(spin, g, 0, cross(t, n))
+            g0 += q
+            e += 1
+            put3(position, e, 0, p)
+    # Tip to base: moments, section balance, path lengths.
+    lever = apply(rotation_matrix(get4(ends, e)), (load[10], load[11], load[12]))
+    m_end = axpy(mass, cross(lever, gravity), (load[3], load[4], load[5]))
+    for i in range(tension.size):
+        length[i] = 0.0
+        if model.kind[i] == TENDON:
+            tension[i] = drive[i]
+    for k in range(elements.size - 1, -1, -1):
+        q, h, scale = nodes[k], model.length[k] / elements[k], model.length[k]
+        i0, mk = first_muscle[k], first_muscle[k + 1] - first_muscle[k]
+        for _ in range(elements[k]):
+            g0 -= q
+            for j in range(q):
+                g = g0 + j
+                m = m_end
+                for l in range(q):
+                    m = axpy(h * (b[k, l] - a[k, j, l]), get3(spin, g0 + l, 0), m)
+                put3(ws.moment, g, 0, m)
+                u, v = get3(strain, g, 0), get3(strain, g, 3)
+                ru = axpy(-1.0, apply_transposed(get9(rotation, g), m), ORIGIN)
+                rv = axpy(-1.0, get3(ws.force, g, 0), ORIGIN)
+                for c in range(mk):
+                    r = (route[g, c, 0], route[g, c, 1], 0.0)
+                    w = cross(u, r)
+                    t = (v[0] + w[0] + route[g, c, 2], v[1] + w[1] + route[g, c, 3], v[2] + w[2])
+                    norm = np.sqrt(dot(t, t))
+                    if not norm > 1e-9:
+                        return np.inf, np.inf
+                    t = axpy(1.0 / norm, t, ORIGIN)
+                    put3(path, g, 4 * c, t)
+                    path[g, 4 * c + 3] = norm
+                    length[i0 + c] += h * b[k, j] * norm
+                    ru = axpy(tension[i0 + c], cross(r, t), ru)
+                    rv = axpy(tension[i0 + c], t, rv)
+                put3(residual, g, 0, ru)
+                put3(residual, g, 3, rv)
+                for i in range(6):
+                    stiffness = model.stiffness[k, i]
+                    residual[g, i] += stiffness * (strain[g, i] - model.reference[k, i])
+                    size = abs(residual[g, i]) / stiffness * (scale if i < 3 else 1.0)
+                    worst = max(worst, size)
+                    total += size * size
+            for j in range(q):
+                m_end = axpy(h * b[k, j], get3(spin, g0 + j, 0), m_end)
+    for i in range(tension.size):
+        if model.kind[i] == TENDON:
+            ws.gap[i], ws.softness[i] = 0.0, 1.0
+            continue
+        rest = model.rest_length[i]
+        delta, ws.softness[i], _ = elongation(model.kind[i], model.parameters, i, rest, tension[i], drive[i])
+        ws.gap[i] = length[i] - rest - delta
+        size = abs(ws.gap[i]) / rest
+        worst = max(worst, size)
+        total += size * size
+    if not total < np.inf:
+        return np.inf, np.inf
+    return worst, total
+
+
+@inner
+def _section(model, k, g, tension, strain, damping, ws):
+    """Linearise the section at node g: H = K + sum_i F_i d[r x t; t]/dxi, dv eliminated.
+
+    In the body frame, with n = R^T n, m = R^T m, B = H_vv^-1 and G = H_uv B:
+    S = H_uu - G H_vu; N = G [n] - [m]; X = v n^T - (v.n) 1 - [n] B [n]; Y = [n] G^T; e = c_u - G c_v; z = [n] B c_v.
+    Writes the global-frame blocks M = R S R^T, N, X, Y and e, z.
+    """
+    stiffness, route = model.stiffness, model.route
+    i0, mk = model.first_muscle[k], model.first_muscle[k + 1] - model.first_muscle[k]
+    d = 1.0 + damping
+    uu = (d * stiffness[k, 0], 0.0, 0.0, 0.0, d * stiffness[k, 1], 0.0, 0.0, 0.0, d * stiffness[k, 2])
+    vv = (d * stiffness[k, 3], 0.0, 0.0, 0.0, d * stiffness[k, 4], 0.0, 0.0, 0.0, d * stiffness[k, 5])
+    vu = scalar_matrix(0.0)
+    for c in range(mk):
+        lever = (route[g, c, 0], route[g, c, 1], 0.0)
+        t = get3(ws.path, g, 4 * c)
+        put3(ws.wrench, g, 6 * c, cross(lever, t))
+        put3(ws.wrench, g, 6 * c + 3, t)
+        f = tension[i0 + c] / ws.path[g, 4 * c + 3]
+        p = axpy9(-f, outer(t, t), scalar_matrix(f))
+        arm = cross_matrix((-lever[0], -lever[1], 0.0))
+        pa = matmul(p, arm)
+        vv = axpy9(1.0, p, vv)
+        vu = axpy9(1.0, pa, vu)
+        uu = axpy9(1.0, matmul(transpose(arm), pa), uu)
+    flexibility = inverse(vv)
+    slide = matmul(flexibility, vu)
+    gain = transpose(slide)
+    put9(ws.compliance, g, flexibility)
+    put9(ws.slide, g, slide)
+    r = get9(ws.rotation, g)
+    back = transpose(r)
+    n, v = get3(ws.force, g, 0), get3(strain, g, 3)
+    nb = cross_matrix(n)
+    nf = matmul(nb, flexibility)
+    put9(ws.m_block, g, matmul(matmul(r, axpy9(-1.0, matmul(gain, vu), uu)), back))
+    y = matmul(nb, slide)
+    put9(ws.y_block, g, matmul(matmul(r, y), back))
+    # G [n] = -Y^T, and R [R^T m] R^T = [m].
+    minus_n = axpy9(1.0, cross_matrix(get3(ws.moment, g, 0)), matmul(matmul(r, transpose(y)), back))
+    put9(ws.n_block, g, axpy9(-1.0, minus_n, scalar_matrix(0.0)))
+    x = axpy9(-1.0, matmul(nf, nb), axpy9(1.0, outer(v, n), scalar_matrix(-dot(v, n))))
+    put9(ws.x_block, g, matmul(matmul(r, x), back))
+    for c in range(mk):
+        cu, cv = get3(ws.wrench, g, 6 * c), get3(ws.wrench, g, 6 * c + 3)
+        put3(ws.pull, g, 3 * c, apply(r, axpy(-1.0, apply(gain, cv), cu)))
+        put3(ws.swing, g, 3 * c, apply(r, apply(nf, cv)))
+
+
+@inner
+def eliminate(model, strain, tension, load, damping, ws):
+    """Factorise the tangent at the state last given to `evaluate`, with `damping` times K added to it.
+
+    For an element with w = (w_1..w_q), incoming rotation phi_0 and the module's dF, with A_rk = b_k - a_rk (A_0k = b_k):
+    dm_r = D_r w + D_r0 phi_0 + D_rF dF + ..., where D_rl = h b_l P + h^2 sum_k A_rk a_kl X_k + h A_rl Y_l,
+    D_r0 = P + h sum_k A_rk X_k and D_rF = Q + h sum_k A_rk z_k. Node r balances M w_r + N phi_r + e dF - dm_r = -rho_r;
+    row 0 is the moment at the element's base, which the element before it sees. Path lengths follow from
+    dl = stretch w + alpha phi_0 + beta dF.
+    """
+    a, b, elements, nodes, first_muscle = model.a, model.b, model.elements, model.nodes, model.first_muscle
+    matrix, phi, pulled, base, stretch = ws.matrix, ws.phi, ws.pulled, ws.base, ws.stretch
+    pull, swing, x_block, y_block, n_block, beta = (
+        ws.pull,
+        ws.swing,
+        ws.x_block,
+        ws.y_block,
+        ws.n_block,
+        ws.beta,
+    )
+    m, wide = model.route.shape[1], b.shape[1]
+    handed = ws.handed
+    big_q, new_q, alpha, new_alpha = 0, m, 2 * m, 3 * m  # first rows in `handed`
+    g0 = model.mass_below.size
+    gravity = (load[6], load[7], load[8])
+    lever = apply(rotation_matrix(get4(ws.ends, ws.ends.shape[0] - 1)), (load[10], load[11], load[12]))
+    mass = load[PAYLOAD_MASS]
+    p_end = axpy9(mass, outer(lever, gravity), scalar_matrix(-mass * dot(lever, gravity)))
+    zero = scalar_matrix(0.0)
+    for k in range(elements.size - 1, -1, -1):
+        q, h = nodes[k], model.length[k] / elements[k]
+        i0, mk = first_muscle[k], first_muscle[k + 1] - first_muscle[k]
+        for c in range(mk):
+            put3(handed, alpha + c, 0, ORIGIN)
+            put3(handed, big_q + c, 0, ORIGIN)
+            for c2 in range(mk):
+                beta[c, c2] = 0.0
+        for _ in range(elements[k]):
+            g0 -= q
+            for j in range(q):
+                _section(model, k, g0 + j, tension, strain, damping, ws)
+            p_new = zero
+            for r in range(q + 1):  # row 0: the base; rows 1..q: the nodes
+                row = g0 + r - 1
+                for l in range(q):
+                    block = axpy9(h * b[k, l], p_end, zero)
+                    for kk in range(q):
+                        late = b[k, kk] if r == 0 else b[k, kk] - a[k, r - 1, kk]
+                        block = axpy9(h * h * late * a[k, kk, l], get9(x_block, g0 + kk), block)
+                    late = b[k, l] if r == 0 else b[k, l] - a[k, r - 1, l]
+                    block = axpy9(h * late, get9(y_block, g0 + l), block)
+                    if r == 0:
+                        put9(base, g0 + l, block)
+                        continue
+                    block = axpy9(-1.0, block, axpy9(h * a[k, r - 1, l], get9(n_block, row), zero))
+                    if l == r - 1:
+                        block = axpy9(1.0, get9(ws.m_block, row), block)
+                    put9(matrix, row * wide + l, block)
+                block = p_end
+                for kk in range(q):
+                    late = b[k, kk] if r == 0 else b[k, kk] - a[k, r - 1, kk]
+                    block = axpy9(h * late, get9(x_block, g0 + kk), block)
+                if r == 0:
+                    p_new = block
+                else:
+                    put9(phi, row, axpy9(-1.0, get9(n_block, row), block))
+                for c in range(mk):
+                    x = get3(handed, big_q + c, 0)
+                    for kk in range(q):
+                        late = b[k, kk] if r == 0 else b[k, kk] - a[k, r - 1, kk]
+                        x = axpy(h * late, get3(swing, g0 + kk, 3 * c), x)
+                    if r == 0:
+                        put3(handed, new_q + c, 0, x)
+                    else:
+                        put3(pulled, row, 3 * c, axpy(-1.0, get3(pull, row, 3 * c), x))
+            for c in range(mk):
+                x0 = get3(handed, alpha + c, 0)
+                x = x0
+                for j in range(q):
+                    x = axpy(-h * b[k, j], get3(swing, g0 + j, 3 * c), x)
+                put3(handed, new_alpha + c, 0, x)
+                for l in range(q):
+                    x = axpy(b[k, l], axpy(1.0, x0, get3(pull, g0 + l, 3 * c)), ORIGIN)
+                    for j in range(q):
+                        x = axpy(-h * b[k, j] * a[k, j, l], get3(swing, g0 + j, 3 * c), x)
+                    put3(stretch, g0 + l, 3 * c, axpy(h, x, ORIGIN))
+                for c2 in range(mk):
+                    for j in range(q):
+                        t, t2 = get3(ws.wrench, g0 + j, 6 * c + 3), get3(ws.wrench, g0 + j, 6 * c2 + 3)
+                        beta[c, c2] -= h * b[k, j] * dot(t, apply(get9(ws.compliance, g0 + j), t2))
+            _factorise_blocks(matrix, phi, pulled, g0, q, wide, mk)
+            for l in range(g0, g0 + q):
+                p_new = axpy9(1.0, matmul(get9(base, l), get9(phi, l)), p_new)
+                for c in range(mk):
+                    x = apply_transposed(get9(phi, l), get3(stretch, l, 3 * c))
+                    put3(handed, new_alpha + c, 0, axpy(1.0, x, get3(handed, new_alpha + c, 0)))
+                    x = apply(get9(base, l), get3(pulled, l, 3 * c))
+                    put3(handed, new_q + c, 0, axpy(1.0, x, get3(handed, new_q + c, 0)))
+                    for c2 in range(mk):
+                        beta[c, c2] += dot(get3(stretch, l, 3 * c), get3(pulled, l, 3 * c2))
+            for c in range(mk):
+                put3(handed, alpha + c, 0, get3(handed, new_alpha + c, 0))
+                put3(handed, big_q + c, 0, get3(handed, new_q + c, 0))
+            p_end = p_new
+        # The module's tensions: (beta - softness) dF + alpha phi_0 = -(gap + gamma).
+        muscle, follow = ws.muscle_matrix[k], ws.muscle_phi[k]
+        for c in range(mk):
+            tendon = model.kind[i0 + c] == TENDON  # its row: -dF = -gap
+            for c2 in range(mk):
+                muscle[c, c2] = 0.0 if tendon else beta[c, c2]
+            muscle[c, c] -= ws.softness[i0 + c]
+            put3(follow, c, 0, ORIGIN if tendon else get3(handed, alpha + c, 0))
+            put3(ws.muscle_moment[k], c, 0, get3(handed, big_q + c, 0))
+        _factorise(muscle, mk)
+        for d in range(3):
+            for c in range(mk):
+                ws.gamma[c] = follow[c, d]
+            _substitute(muscle, mk, ws.gamma, 0)
+            for c in range(mk):
+                follow[c, d] = ws.gamma[c]
+        for c in range(mk):
+            p_end = axpy9(-1.0, outer(get3(handed, big_q + c, 0), get3(follow, c, 0)), p_end)
+
+
+@inner
+def _factorise_blocks(matrix, phi, pulled, g0, q, wide, mk):
+    """LU without pivoting, in 3 x 3 blocks, of an element's matrix; `phi` and `pulled` become the solutions.
+
+    At a stable equilibrium the matrix is positive definite up to a diagonal scaling, so pivoting buys nothing; where it is
+    singular the answer is not finite. Diagonal blocks are stored inverted.
+    """
+    for k in range(q):
+        row_k = (g0 + k) * wide
+        pivot = inverse(get9(matrix, row_k + k))
+        put9(matrix, row_k + k, pivot)
+        phi_k = get9(phi, g0 + k)
+        for i in range(k + 1, q):
+            row_i = (g0 + i) * wide
+            factor = matmul(get9(matrix, row_i + k), pivot)
+            put9(matrix, row_i + k, factor)
+            for j in range(k + 1, q):
+                product = matmul(factor, get9(matrix, row_k + j))
+                put9(matrix, row_i + j, axpy9(-1.0, product, get9(matrix, row_i + j)))
+            put9(phi, g0 + i, axpy9(-1.0, matmul(factor, phi_k), get9(phi, g0 + i)))
+            for c in range(mk):
+                x = apply(factor, get3(pulled, g0 + k, 3 * c))
+                put3(pulled, g0 + i, 3 * c, axpy(-1.0, x, get3(pulled, g0 + i, 3 * c)))
+    for k in range(q - 1, -1, -1):
+        row_k = (g0 + k) * wide
+        block = get9(phi, g0 + k)
+        for l in range(k + 1, q):
+            block = axpy9(-1.0, matmul(get9(matrix, row_k + l), get9(phi, g0 + l)), block)
+        put9(phi, g0 + k, matmul(get9(matrix, row_k + k), block))
+        for c in range(mk):
+            x = get3(pulled, g0 + k, 3 * c)
+            for l in range(k + 1, q):
+                x = axpy(-1.0, apply(get9(matrix, row_k + l), get3(pulled, g0 + l, 3 * c)), x)
+            put3(pulled, g0 + k, 3 * c, apply(get9(matrix, row_k + k), x))
+
+
+@inner
+def _factorise(mat, size):
+    """LU without pivoting of mat[:size, :size], in place, the diagonal of U inverted: definite, as in blocks."""
+    for k in range(size):
+        mat[k, k] = 1.0 / mat[k, k]
+        for i in range(k + 1, size):
+            mat[i, k] *= mat[k, k]
+            for j in range(k + 1, size):
+                mat[i, j] -= mat[i, k] * mat[k, j]
+
+
+@inner
+def _substitute(mat, size, x, x0):
+    """Solve with the factors of `_factorise` for x[x0 : x0 + size], in place."""
+    for i in range(size):
+        value = x[x0 + i]
+        for l in range(i):
+            value -= mat[i, l] * x[x0 + l]
+        x[x0 + i] = value
+    for i in range(size - 1, -1, -1):
+        value = x[x0 + i]
+        for l in range(i + 1, size):
+            value -= mat[i, l] * x[x0 + l]
+        x[x0 + i] = value * mat[i, i]
+
+
+@inner
+def substitute(model, ws):
+    """Solve the factorised tangent for the right-hand side -(ws.residual, ws.gap).
+
+    Writes the changes of strain (`ws.bend`, `ws.shear`), tension (`ws.tension`) and tip (`ws.tip`); returns the largest
+    rotation [rad] and the largest |dv| of the step.
+    """
+    a, b, elements, nodes, first_muscle = model.a, model.b, model.elements, model.nodes, model.first_muscle
+    matrix, answer, tension, gamma, wide = ws.matrix, ws.answer, ws.tension, ws.gamma, b.shape[1]
+    residual, rotation, wrench, sources = ws.residual, ws.rotation, ws.wrench, ws.sources
+    g0 = model.mass_below.size
+    p_end = ORIGIN
+    for k in range(elements.size - 1, -1, -1):
+        q, h = nodes[k], model.length[k] / elements[k]
+        i0, mk = first_muscle[k], first_muscle[k + 1] - first_muscle[k]
+        for c in range(mk):
+            gamma[c] = 0.0
+        for _ in range(elements[k]):
+            g0 -= q
+            for j in range(q):
+                g = g0 + j
+                r, ru, rv = get9(rotation, g), get3(residual, g, 0), get3(residual, g, 3)
+                slid = apply(get9(ws.compliance, g), rv)
+                put3(sources, j, 0, apply(r, axpy(-1.0, apply_transposed(get9(ws.slide, g), rv), ru)))
+                put3(sources, j, 3, apply(r, cross(get3(ws.force, g, 0), slid)))
+                for c in range(mk):
+                    gamma[c] -= h * b[k, j] * dot(get3(wrench, g, 6 * c + 3), slid)
+            for j in range(q):
+                x = axpy(-1.0, get3(sources, j, 0), p_end)
+                for l in range(q):
+                    x = axpy(h * (b[k, l] - a[k, j, l]), get3(sources, l, 3), x)
+                put3(answer, g0 + j, 0, x)
+            for j in range(q):
+                x = get3(answer, g0 + j, 0)
+                for l in range(j):
+                    x = axpy(-1.0, apply(get9(matrix, (g0 + j) * wide + l), get3(answer, g0 + l, 0)), x)
+                put3(answer, g0 + j, 0, x)
+            for j in range(q - 1, -1, -1):
+                x = get3(answer, g0 + j, 0)
+                for l in range(j + 1, q):
+                    x = axpy(-1.0, apply(get9(matrix, (g0 + j) * wide + l), get3(answer, g0 + l, 0)), x)
+                put3(answer, g0 + j, 0, apply(get9(matrix, (g0 + j) * wide + j), x))
+            for l in range(q):
+                w = get3(answer, g0 + l, 0)
+                p_end = axpy(
+                    h * b[k, l], get3(sources, l, 3), axpy(1.0, apply(get9(ws.base, g0 + l), w), p_end)
+                )
+                for c in range(mk):
+                    gamma[c] += dot(get3(ws.stretch, g0 + l, 3 * c), w)
+        # dF for phi_0 = 0; the part that follows phi_0 is in muscle_phi.
+        for c in range(mk):
+            tension[i0 + c] = -ws.gap[i0 + c] - (0.0 if model.kind[i0 + c] == TENDON else gamma[c])
+        _substitute(ws.muscle_matrix[k], mk, tension, i0)
+        for c in range(mk):
+            p_end = axpy(tension[i0 + c], get3(ws.muscle_moment[k], c, 0), p_end)
+    # Base to tip.
+    phi0, dp = ORIGIN, ORIGIN
+    most_rotation = most_shear = 0.0
+    for k in range(elements.size):
+        q, h = nodes[k], model.length[k] / elements[k]
+        i0, mk = first_muscle[k], first_muscle[k + 1] - first_muscle[k]
+        for c in range(mk):
+            tension[i0 + c] -= dot(get3(ws.muscle_phi[k], c, 0), phi0)
+        for _ in range(elements[k]):
+            for g in range(g0, g0 + q):
+                w = axpy(1.0, apply(get9(ws.phi, g), phi0), get3(answer, g, 0))
+                for c in range(mk):
+                    w = axpy(tension[i0 + c], get3(ws.pulled, g, 3 * c), w)
+                put3(answer, g, 0, w)
+            for j in range(q):
+                g = g0 + j
+                phi = phi0
+                for l in range(q):
+                    phi = axpy(h * a[k, j, l], get3(answer, g0 + l, 0), phi)
+                most_rotation = max(most_rotation, dot(phi, phi))
+                put3(ws.turned, g, 0, phi)
+                r = get9(rotation, g)
+                bend = apply_transposed(r, get3(answer, g, 0))
+                y = axpy(-1.0, get3(residual, g, 3), cross(get3(ws.force, g, 0), apply_transposed(r, phi)))
+                for c in range(mk):
+                    y = axpy(-tension[i0 + c], get3(wrench, g, 6 * c + 3), y)
+                shear = axpy(-1.0, apply(get9(ws.slide, g), bend), apply(get9(ws.compliance, g), y))
+                most_shear = max(most_shear, dot(shear, shear))
+                put3(ws.bend, g, 0, bend)
+                put3(ws.shear, g, 0, shear)
+                dp = axpy(h * b[k, j], axpy(1.0, cross(phi, get3(ws.tangent, g, 0)), apply(r, shear)), dp)
+            for l in range(q):
+                phi0 = axpy(h * b[k, l], get3(answer, g0 + l, 0), phi0)
+            g0 += q
+    ws.tip[0], ws.tip[1], ws.tip[2] = dp
+    ws.tip[3], ws.tip[4], ws.tip[5] = phi0
+    return np.sqrt(max(most_rotation, dot(phi0, phi0))), np.sqrt(most_shear)
+
+
+@inner
+def newton(model, strain, tension, drive, load, damping, ws):
+    """Solve by damped Newton from (strain, tension), in place.
+
+    Without `damping`, steps are capped in rotation and shear and halved until the sum of squared residuals falls. With it,
+    each step is one of linearly implicit Euler for a rod with viscosity proportional to K, its time step growing as
+    the residual falls (pseudo-transient continuation): the fall of a real, strongly damped arm. There is one call of
+    `evaluate` for first looks, steps and halvings alike, because the compiler inlines every call.
+
+    Returns
+    -------
+    tuple
+        converged (bool), dimensionless residual, iterations.
+    """
+    worst, total = np.inf, np.inf
+    taken, smallest, move = 1.0, 0.0, 0.0
+    iterations = 0
+    falling = damping > 0.0
+    limit = MAX_FALL if falling else MAX_ITERATIONS
+    while True:
+        new_worst, new_total = evaluate(model, strain, tension, drive, load, iterations > 0, ws)
+        if iterations == 0 or new_total < (1.0 - 0.1 * taken) * total or (falling and new_total < np.inf):
+            if falling and iterations > 0:
+                damping *= min(2.0, max(0.5, np.sqrt(new_total / total)))
+            worst, total = new_worst, new_total
+            if worst < model.tolerance:
+                return True, worst, iterations
+            if iterations == limit or not worst < np.inf:
+                return False, worst, iterations
+            eliminate(model, strain, tension, load, damping, ws)
+            rotation, shear = substitute(model, ws)
+            if not (rotation < 1e6 and shear < 1e6):
+                return False, worst, iterations
+            taken = min(1.0, MAX_ROTATION_STEP / max(rotation, 1e-300), MAX_SHEAR_STEP / max(shear, 1e-300))
+            smallest = 0.01 * taken
+            iterations += 1
+            move = taken
+        else:  # `evaluate` leaves the step alone, so that half of it can be taken back
+            if taken < smallest:
+                return False, worst, iterations
+            taken *= 0.5
+            move = -taken
+        for g in range(strain.shape[0]):
+            put3(strain, g, 0, axpy(move, get3(ws.bend, g, 0), get3(strain, g, 0)))
+            put3(strain, g, 3, axpy(move, get3(ws.shear, g, 0), get3(strain, g, 3)))
+            half = axpy(0.5 * move, get3(ws.turned, g, 0), ORIGIN)
+            put4(ws.quaternion, g, quaternion_turn(half, get4(ws.quaternion, g)))
+        for i in range(tension.size):
+            tension[i] += move * ws.tension[i]
+
+
+WARM, SUBSTEPS, FALL, FAILED = 0, 1, 2, 3
+SMALLEST_SUBSTEP = 1.0 / 128.0
+FIRST_DAMPING = 1.0
+
+
+@inner
+def solve(model, strain, tension, from_drive, from_load, drive, load, ws):
+    """Find the equilibrium that continues a known one, in place.
+
+    Newton from the known state first. Where it fails, drive and load go from the known ones to the asked ones in substeps,
+    halved on failure and doubled on success. Where the branch of equilibria ends on the way (a fold), the arm falls from
+    there, at the asked drive and load. Arguments as in `solve_lanes`, for one arm.
+
+    Returns
+    -------
+    tuple
+        rung (WARM, SUBSTEPS, FALL or FAILED), dimensionless residual, Newton iterations in all.
+    """
+    strain0, tension0 = strain.copy(), tension.copy()
+    good_strain, good_tension = strain0.copy(), tension0.copy()
+    drive_now, load_now = drive.copy(), load.copy()
+    done, step, spent, rung, damping = 0.0, 1.0, 0, WARM, 0.0
+    while True:
+        here = min(1.0, done + step)
+        for i in range(drive.size):
+            drive_now[i] = drive[i] if here == 1.0 else from_drive[i] + here * (drive[i] - from_drive[i])
+        for i in range(load.size):
+            load_now[i] = load[i] if here == 1.0 else from_load[i] + here * (load[i] - from_load[i])
+        converged, worst, iterations = newton(model, strain, tension, drive_now, load_now, damping, ws)
+        spent += iterations
+        if converged:
+            if here == 1.0:
+                return rung, worst, spent
+            done, step = here, 2.0 * step
+            good_strain[:] = strain
+            good_tension[:] = tension
+            continue
+        if rung == FALL:
+            strain[:] = strain0
+            tension[:] = tension0
+            return FAILED, worst, spent
+        strain[:] = good_strain
+        tension[:] = good_tension
+        step = 0.25 if rung == WARM else 0.5 * step
+        rung = SUBSTEPS
+        if step < SMALLEST_SUBSTEP:
+            rung, step, damping = FALL, 1.0, FIRST_DAMPING
+
+
+@entry
+def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report):
+    """Solve N arms of one model, each from its own known equilibrium.
+
+    Parameters
+    ----------
+    model : Model
+        The arm.
+    strain, tension : (N, G, 6), (N, n) arrays
+        In: known equilibria. Out: the asked ones; unchanged where there was none.
+    from_drive, from_load : (N, n), (N, LOAD) arrays
+        In: where (strain, tension) are in equilibrium. Out: the asked ones; unchanged where there was none.
+    drive, load : (N, n), (N, LOAD) arrays
+        What is asked.
+    tip : (N, 7) array
+        Out: tip quaternion and position [m]; unchanged where there was no answer.
+    lengths : (N, n) array
+        Out: path lengths [m]; unchanged where there was no answer.
+    report : (N, 3) array
+        Out: rung (WARM, SUBSTEPS, FALL or FAILED), dimensionless residual, Newton iterations.
+    """
+    ws = workspace(model)
+    for lane in range(strain.shape[0]):
+        rung, worst, iterations = solve(
+            model, strain[lane], tension[lane], from_drive[lane], from_load[lane], drive[lane], load[lane], ws
+        )
+        report[lane, 0], report[lane, 1], report[lane, 2] = rung, worst, iterations
+        if rung == FAILED:
+            continue
+        tip[lane, :4] = ws.ends[-1]
+        tip[lane, 4:] = ws.position[-1]
+        lengths[lane] = ws.length
+        from_drive[lane] = drive[lane]
+        from_load[lane] = load[lane]
+
+
+@entry
+def tip_jacobian(model, strain, tension, drive, load):
+    """Return d(tip position, tip rotation)/d drive (6, n) by the implicit function theorem; not finite where it has none."""
+    ws = workspace(model)
+    jacobian = np.empty((6, tension.size))
+    evaluate(model, strain, tension, drive, load, False, ws)
+    eliminate(model, strain, tension, load, 0.0, ws)
+    ws.residual[:] = 0.0
+    ws.gap[:] = 0.0
+    for i in range(tension.size):
+        if model.kind[i] == TENDON:
+            ws.gap[i] = 1.0  # its row reads -dF = -gap
+        else:
+            _, _, slope = elongation(
+                model.kind[i], model.parameters, i, model.rest_length[i], tension[i], drive[i]
+            )
+            ws.gap[i] = -slope
+        substitute(model, ws)
+        jacobian[:, i] = ws.tip
+        ws.gap[i] = 0.0
+    return jacobian
+
+
+@entry
+def shape(model, strain, tension, drive, load):
+    """Return an evaluated state: quaternions at ends and nodes, positions at ends, p' and p' x n at nodes, path lengths."""
+    ws = workspace(model)
+    evaluate(model, strain, tension, drive, load, False, ws)
+    return ws.ends, ws.quaternion, ws.position, ws.tangent, ws.spin, ws.length
