@@ -41,9 +41,7 @@ def bending_module(tca: TCA | None = None) -> Module:
     """Return the paper's 3D bending module: three straight TCAs around a soft cylinder."""
     law = tca or TCA()
     muscles = [Muscle(BENDING_OFFSET, angle, 0.0, law) for angle in BENDING_ANGLES]
-    return Module.cylinder(
-        BENDING_LENGTH, BODY_DIAMETER, YOUNGS_MODULUS, SHEAR_MODULUS, BENDING_MASS, muscles
-    )
+    return Module.cylinder(BENDING_LENGTH, BODY_DIAMETER, YOUNGS_MODULUS, SHEAR_MODULUS, BENDING_MASS, muscles)
 
 
 def bending_arm(tca: TCA | None = None) -> Arm:

@@ -3,21 +3,24 @@
 A matrix is its nine numbers, row by row. A quaternion is (w, x, y, z).
 """
 
+from typing import Any
+
 from numba import njit
 
 # Not nnan or ninf: overflow must stay visible.
-OPTIONS = {
+OPTIONS: dict[str, Any] = {
     "cache": True,
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
     "nogil": True,
     "no_cfunc_wrapper": True,
 }
+INNER: dict[str, Any] = {"no_cpython_wrapper": True, **OPTIONS}
 entry = njit(**OPTIONS)
 """Decorator of kernels that Python calls."""
-inner = njit(no_cpython_wrapper=True, **OPTIONS)
+inner = njit(**INNER)
 """Decorator of kernels that only kernels call: without wrappers they compile faster."""
-_small = njit(no_cpython_wrapper=True, forceinline=True, **OPTIONS)
+_small = njit(forceinline=True, **INNER)
 
 
 @_small

@@ -70,9 +70,7 @@ class Module:
             raise ValueError(
                 f"reference_strain = {self.reference_strain!r}: expected v*_z > 0, the rod's own direction"
             )
-        object.__setattr__(
-            self, "mass_per_length", check.scalar("mass_per_length", self.mass_per_length, 0.0)
-        )
+        object.__setattr__(self, "mass_per_length", check.scalar("mass_per_length", self.mass_per_length, 0.0))
         try:
             muscles = tuple(self.muscles)
         except TypeError:
@@ -146,9 +144,7 @@ class Module:
     def rest_length(self, muscle: Muscle, nodes: int = 64) -> float:
         """Return the path length of a muscle in the unloaded rod [m], l* of eq. (24), by Gauss quadrature."""
         _, weights, points = gauss(nodes)
-        return self.length * float(
-            sum(w * self._stretch(muscle, x) for w, x in zip(weights, points, strict=True))
-        )
+        return self.length * float(sum(w * self._stretch(muscle, x) for w, x in zip(weights, points, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -192,10 +188,8 @@ def integrals(c: Array, x: Array) -> Array:
     q = len(c)
     legendre = np.polynomial.legendre
     vandermonde = legendre.legvander(2.0 * c - 1.0, q - 1)
-    columns = [
-        legendre.legval(2.0 * x - 1.0, legendre.legint(np.eye(q)[k], lbnd=-1.0)) / 2.0 for k in range(q)
-    ]
-    return np.linalg.solve(vandermonde.T, np.array(columns)).T
+    columns = [legendre.legval(2.0 * x - 1.0, legendre.legint(np.eye(q)[k], lbnd=-1.0)) / 2.0 for k in range(q)]
+    return np.asarray(np.linalg.solve(vandermonde.T, np.array(columns)).T, dtype=np.float64)
 
 
 def default_grid(module: Module) -> Grid:
@@ -250,9 +244,7 @@ class Arm:
             raise ValueError(f"payload = {payload!r}: expected a Payload or None")
         self.payload = payload
         self.grids = (
-            tuple(default_grid(m) for m in self.modules)
-            if grids is None
-            else _checked(grids, len(self.modules))
+            tuple(default_grid(m) for m in self.modules) if grids is None else _checked(grids, len(self.modules))
         )
         self.tolerance = check.scalar("tolerance", tolerance, 1e-12, 1e-3)
         self.length = sum(module.length for module in self.modules)
@@ -331,13 +323,10 @@ class Arm:
         rung, residual, iterations = report[0].tolist()
         converged = rung != FAILED
         if converged:
-            message = f"converged below {self.tolerance:g}" + (
-                " in substeps of drive and load" if rung == SUBSTEPS else ""
-            )
+            how = {SUBSTEPS: " in substeps of drive and load", FALL: " after a fall from the end of the start's branch"}
+            message = f"converged below {self.tolerance:g}" + how.get(rung, "")
         else:
-            message = (
-                "no equilibrium found by Newton or by substeps in drive and load; this is the start's shape"
-            )
+            message = "no equilibrium found by Newton, substeps or a damped fall; this is the start's shape"
             ends, _, position, _, _, lengths[0] = shape(self.model, strain, tension, from_drive, from_load)
             tip[0, :4], tip[0, 4:] = ends[-1], position[-1]
         # Where there is no answer, from_drive and from_load still are the start's.
@@ -373,10 +362,7 @@ class Arm:
     def _restart(self, start: Equilibrium) -> tuple[Array, Array, Array, Array]:
         if not isinstance(start, Equilibrium):
             raise ValueError(f"start = {start!r}: expected an Equilibrium or None")
-        if (
-            start.tensions.shape != (len(self.muscles),)
-            or abs(start.length - self.length) > 1e-9 * self.length
-        ):
+        if start.tensions.shape != (len(self.muscles),) or abs(start.length - self.length) > 1e-9 * self.length:
             raise ValueError(
                 f"start has {start.tensions.size} muscles and length {start.length:g} m: expected an equilibrium of this "
                 f"arm, with {len(self.muscles)} and {self.length:g} m"
@@ -480,9 +466,7 @@ def pose(quaternion: Array, position: Array) -> Array:
 def _half_product(q: Array, u: Array) -> Array:
     """Return (q o [0, u])/2, eq. (28)."""
     (w, x, y, z), (a, b, c) = q, u
-    return 0.5 * np.array(
-        [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
-    )
+    return 0.5 * np.array([-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a])
 
 
 def _vector(name: str, value: ArrayLike) -> ArrayLike:

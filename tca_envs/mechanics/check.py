@@ -20,19 +20,12 @@ def scalar(name: str, value: Any, low: float = -np.inf, high: float = np.inf, ab
 
 def array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
     """Return a float64 copy of `value`, finite and of `shape` (None: any size); ValueError otherwise."""
-    expected = (
-        "("
-        + ", ".join("any" if n is None else str(n) for n in shape)
-        + ("," if len(shape) == 1 else "")
-        + ")"
-    )
+    expected = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
     try:
         result = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"{name} = {value!r}: expected finite numbers of shape {expected}") from None
-    if result.ndim != len(shape) or any(
-        n is not None and n != m for n, m in zip(shape, result.shape, strict=True)
-    ):
+    if result.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, result.shape, strict=True)):
         raise ValueError(f"{name} = {value!r} has shape {result.shape}: expected shape {expected}")
     if not np.isfinite(result).all():
         raise ValueError(f"{name} = {value!r}: expected finite numbers")

@@ -603,9 +603,7 @@ def substitute(model, ws):
                 put3(answer, g0 + j, 0, apply(get9(matrix, (g0 + j) * wide + j), x))
             for l in range(q):
                 w = get3(answer, g0 + l, 0)
-                p_end = axpy(
-                    h * b[k, l], get3(sources, l, 3), axpy(1.0, apply(get9(ws.base, g0 + l), w), p_end)
-                )
+                p_end = axpy(h * b[k, l], get3(sources, l, 3), axpy(1.0, apply(get9(ws.base, g0 + l), w), p_end))
                 for c in range(mk):
                     gamma[c] += dot(get3(ws.stretch, g0 + l, 3 * c), w)
         # dF for phi_0 = 0; the part that follows phi_0 is in muscle_phi.
@@ -802,9 +800,7 @@ def tip_jacobian(model, strain, tension, drive, load):
         if model.kind[i] == TENDON:
             ws.gap[i] = 1.0  # its row reads -dF = -gap
         else:
-            _, _, slope = elongation(
-                model.kind[i], model.parameters, i, model.rest_length[i], tension[i], drive[i]
-            )
+            _, _, slope = elongation(model.kind[i], model.parameters, i, model.rest_length[i], tension[i], drive[i])
             ws.gap[i] = -slope
         substitute(model, ws)
         jacobian[:, i] = ws.tip

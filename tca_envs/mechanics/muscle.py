@@ -49,17 +49,13 @@ def elongation(kind, parameters, i, rest_length, tension, drive):
         scale = rest_length / parameters[i, 0]
         x = drive - parameters[i, 9]
         x0 = parameters[i, 10] - parameters[i, 9]
-        untwist = (parameters[i, 6] * x + parameters[i, 7]) * x - (
-            parameters[i, 6] * x0 + parameters[i, 7]
-        ) * x0
+        untwist = (parameters[i, 6] * x + parameters[i, 7]) * x - (parameters[i, 6] * x0 + parameters[i, 7]) * x0
         heated = parameters[i, 1] * untwist
         heated_slope = parameters[i, 1] * (2.0 * parameters[i, 6] * x + parameters[i, 7])
         # Beyond the measured range the tangent at its end continues the curve: the law stays monotone.
         inside = min(max(tension, 0.0), parameters[i, 8])
         modulus = parameters[i, 3] + (parameters[i, 4] + parameters[i, 5] * inside) * inside
-        slope = (
-            parameters[i, 2] * (parameters[i, 3] - parameters[i, 5] * inside * inside) / (modulus * modulus)
-        )
+        slope = parameters[i, 2] * (parameters[i, 3] - parameters[i, 5] * inside * inside) / (modulus * modulus)
         stretch = parameters[i, 2] * inside / modulus + slope * (tension - inside)
         return scale * (heated + stretch), scale * slope, scale * heated_slope
     if kind == SPRING:
@@ -247,6 +243,4 @@ class Muscle:
         check.scalar("angle", self.angle)
         check.scalar("turns", self.turns, -1000.0, 1000.0)
         if not isinstance(getattr(self.law, "kind", None), int):
-            raise ValueError(
-                f"law = {self.law!r}: expected a muscle law such as TCA(), Tendon() or Spring(rate)"
-            )
+            raise ValueError(f"law = {self.law!r}: expected a muscle law such as TCA(), Tendon() or Spring(rate)")

@@ -45,9 +45,7 @@ def balance(
     return imbalance, tangent
 
 
-def solve(
-    stiffness: Array, reference: Array, route: Array, tension: Array, wrench: Array, strain: Array
-) -> Array:
+def solve(stiffness: Array, reference: Array, route: Array, tension: Array, wrench: Array, strain: Array) -> Array:
     """Return the strain (6,) that carries `wrench`, by Newton from `strain`; arguments as in `balance`."""
     for _ in range(50):
         imbalance, tangent = balance(stiffness, reference, route, tension, strain, wrench)

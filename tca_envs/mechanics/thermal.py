@@ -100,9 +100,7 @@ def power_to_reach(temperature: ArrayLike, target: ArrayLike, duration: float, h
         raise ValueError(f"duration = {duration!r}: expected a positive number of seconds")
     start = np.asarray(temperature, dtype=np.float64)
     kept = np.exp(-duration * heating.loss / heating.capacity)
-    end = (np.asarray(target, dtype=np.float64) - kept * start) / -np.expm1(
-        -duration * heating.loss / heating.capacity
-    )
+    end = (np.asarray(target, dtype=np.float64) - kept * start) / -np.expm1(-duration * heating.loss / heating.capacity)
     return heating.loss * (end - heating.ambient)
 
 

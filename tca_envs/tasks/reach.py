@@ -1,0 +1,149 @@
+"""Reach: heat the bending module so that its tip comes to rest at a goal."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from tca_envs import presets
+from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT, Heater
+from tca_envs.tasks.core import CUT_OFF, Core, Record
+
+Array = NDArray[np.float64]
+
+SUCCESS_CM = 0.1
+"""A tip within 1 mm of the goal has reached it."""
+CELL_K = 5.0
+"""Edge of the cells of temperature space that are dealt out to training and held-out goals [K]."""
+SPLITS = ("train", "held-out")
+
+
+class Reach:
+    """Bring the tip of a soft arm, bent by three heated coils, to a goal position and hold it there.
+
+    ## Description
+
+    The bending module of the paper's arm hangs from its base, the twisting module and the gripper hang from it as dead weight.
+    Three twisted-and-coiled actuators (TCAs) run along it, 120 degrees apart; a heated one contracts and bends the arm
+    towards its side, the cold ones resist. The arm is quasi-static: it is in equilibrium at every step, while the
+    temperatures follow the heating powers with a time constant of 1.8 s.
+
+    ## Action Space
+
+    `Box(-1, 1, (3,), float32)`. Finite values outside are clipped; others raise `ValueError`.
+
+    | Index | Meaning | Min (-1) | Max (+1) | Unit |
+    |---|---|---|---|---|
+    | 0..2 | heating power of TCA 0 (at 0 deg, +x), 1 (120 deg), 2 (240 deg) | 0 | 2 | W |
+
+    A cut-off in the heaters lowers the power so that no TCA passes 158 degC.
+
+    ## Observation Space
+
+    `Dict` of float32 boxes, as goal-conditioned learners (HER) expect it.
+
+    | Key | Index | Meaning | Min | Max | Unit |
+    |---|---|---|---|---|---|
+    | `observation` | 0..2 | (temperature - 25 degC)/125 K of each TCA | 0 | 1.1 | 1 |
+    | | 3..5 | heating power of the last step/full power | 0 | 1 | 1 |
+    | | 6..8 | tip position x, y, z in the base frame, z down | -7, -7, -7 | 7, 7, 7 | cm |
+    | `achieved_goal` | 0..2 | tip position x, y, z | -7 | 7 | cm |
+    | `desired_goal` | 0..2 | goal position x, y, z | -7 | 7 | cm |
+
+    ## Rewards
+
+    `TCAReach-v0`: 0 within 1 mm of the goal, else -1. `TCAReachDense-v0`: minus the distance in cm.
+    `compute_reward(achieved_goal, desired_goal, info)` gives the same, for one goal or a batch; it does not read `info`.
+
+    `info` (from `reset` too) holds `is_success` (within 1 mm now), `distance_mm`, `energy_J` (electrical energy since the
+    episode's start), `cost` (kelvins above the soft limit of 150 degC, summed over the TCAs) and `solver`
+    (`converged`, `residual`, `iterations`).
+
+    ## Starting State
+
+    All TCAs at 25 degC, the arm hanging straight. The goal is the steady state at temperatures drawn uniformly between 25
+    and 150 degC, so that it can be reached and held. Temperature space is dealt out in cells of 5 K: a fifth of them
+    is held out for evaluation, and training goals never come from those.
+
+    ## Episode End
+
+    Truncation after 100 steps of 0.1 s. There is no termination: the goal is to be held. If the solver finds no
+    equilibrium, the last good state stays, `info["solver"]["converged"]` is False and the episode is truncated.
+
+    ## Arguments
+
+    | Name | Default | Meaning |
+    |---|---|---|
+    | `reward` | `"sparse"` (`"dense"` in TCAReachDense-v0) | which reward |
+    | `split` | `"train"` | where goals come from: `"train"` or `"held-out"` |
+
+    ## Version History
+
+    * v0: first version.
+    """
+
+    goal_size = 3
+
+    def __init__(self, split: str) -> None:
+        if split not in SPLITS:
+            raise ValueError(f"split = {split!r}: expected one of {', '.join(map(repr, SPLITS))}")
+        self.split = split
+        box = 7.0  # cm: longer than the arm can be
+        self.goal_space = spaces.Box(-box, box, (3,), np.float32)
+        hottest = (CUT_OFF - AMBIENT) / (SOFT_LIMIT - AMBIENT)
+        low = np.array([0.0] * 6 + [-box] * 3, dtype=np.float32)
+        high = np.array([np.ceil(10.0 * hottest) / 10.0] * 3 + [1.0] * 3 + [box] * 3, dtype=np.float32)
+        self.observation_space = spaces.Box(low, high, dtype=np.float32)
+
+    def core(self, lanes: int) -> Core:
+        """Return `lanes` lanes of this task's arm."""
+        return Core(presets.bending_arm(), Heater(), lanes, self.goal_size)
+
+    def draw_goals(self, core: Core, rng: np.random.Generator, count: int) -> Array:
+        """Return goals (count, 3) [cm]: tips at steady temperatures drawn from this task's split."""
+        goals = np.empty((count, 3))
+        for i in range(count):
+            settled = False
+            while not settled:
+                temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * rng.random(len(core.arm.muscles))
+                if held_out(temperature) != (self.split == "held-out"):
+                    continue
+                record, good = core.settle(temperature[np.newaxis])
+                settled = bool(good[0])
+            goals[i] = self.achieved(record)[0]
+        return goals
+
+    def achieved(self, record: Record) -> Array:
+        """Return what is compared with the goal (N, 3): tip position [cm]."""
+        return 100.0 * record.tip[:, 4:]
+
+    def observe(self, core: Core) -> Array:
+        """Return what a controller measures (N, 9)."""
+        record = core.record
+        temperature = (record.temperature - AMBIENT) / (SOFT_LIMIT - AMBIENT)
+        return np.hstack([temperature, record.power / core.heating.max_power, self.achieved(record)])
+
+    @staticmethod
+    def distance(achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
+        """Return the distance [cm] over the last axis."""
+        return np.linalg.norm(np.asarray(achieved, dtype=np.float64) - np.asarray(desired, dtype=np.float64), axis=-1)
+
+    def success(self, achieved: NDArray[Any], desired: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return whether the goal is reached, over the last axis."""
+        return self.distance(achieved, desired) <= SUCCESS_CM
+
+    def dense_reward(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
+        """Return minus the distance [cm] over the last axis."""
+        return -self.distance(achieved, desired)
+
+    def measures(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mapping[str, Array]:
+        """Return what `info` reports of goals, by key."""
+        return {"distance_mm": 10.0 * self.distance(achieved, desired)}
+
+
+def held_out(temperature: Array) -> bool:
+    """Return whether goals at `temperature` (n,) [degC] are held out: one cell in five, spread evenly over the space."""
+    cells = np.floor((temperature - AMBIENT) / CELL_K).astype(int)
+    return bool((cells * np.arange(1, cells.size + 1)).sum() % 5 == 0)

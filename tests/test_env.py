@@ -1,0 +1,282 @@
+"""Every registered environment: what Gymnasium, learners and people who publish expect of it."""
+
+import copy
+import pickle
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+import tca_envs  # noqa: F401
+from tca_envs.mechanics import collocation
+from tca_envs.mechanics.thermal import HARD_LIMIT, SOFT_LIMIT
+from tca_envs.tasks import core
+
+IDS = sorted(name for name, spec in gym.registry.items() if "tca_envs" in str(spec.entry_point))
+
+
+@pytest.fixture(params=IDS)
+def env(request):
+    made = gym.make(request.param)
+    yield made
+    made.close()
+
+
+def actions(env, count, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1.0, 1.0, (count, *env.action_space.shape)).astype(np.float32)
+
+
+def roll(env, chosen):
+    """Return everything that the steps return."""
+    return [env.step(action) for action in chosen]
+
+
+def assert_same(first, second):
+    """Bitwise: pickles of arrays, floats and dicts are equal only if every bit is."""
+    for a, b in zip(first, second, strict=True):
+        for x, y in zip(a, b, strict=True):
+            if isinstance(x, dict) and "observation" in x:
+                for key in x:
+                    assert x[key].tobytes() == y[key].tobytes()
+            else:
+                assert x == y
+
+
+def test_the_registry_holds_the_environments():
+    assert IDS == ["TCAReach-v0", "TCAReachDense-v0"]
+
+
+def test_checkers_pass_without_a_warning(env):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+        check_env_sb3(env.unwrapped)
+
+
+def test_spec_survives_json(env):
+    spec = gym.envs.registration.EnvSpec.from_json(env.spec.to_json())
+    assert gym.make(spec).unwrapped.reward == env.unwrapped.reward
+
+
+def test_time_limit_is_100_steps_and_nothing_terminates(env):
+    env.reset(seed=0)
+    ends = [(terminated, truncated) for _, _, terminated, truncated, _ in roll(env, actions(env, 100))]
+    assert ends == [(False, False)] * 99 + [(False, True)]
+
+
+def test_reset_forgets_the_past_bitwise(env):
+    chosen = actions(env, 100)
+    first = env.reset(seed=5)
+    expected = roll(env, chosen[:30])
+    for seed, count in ((6, 100), (7, 3)):
+        env.reset(seed=seed)
+        roll(env, actions(env, count, seed))
+    again = env.reset(seed=5)
+    assert_same([first], [again])
+    assert_same(expected, roll(env, chosen[:30]))
+    fresh = gym.make(env.spec.id)
+    fresh.reset(seed=5)
+    assert_same(expected, roll(fresh, chosen[:30]))
+
+
+def test_unseeded_resets_go_on_with_the_seeded_generator(env):
+    env.reset(seed=5)
+    goals = [env.reset()[0]["desired_goal"] for _ in range(3)]
+    env.reset(seed=5)
+    roll(env, actions(env, 10))
+    for goal in goals:
+        assert goal.tobytes() == env.reset()[0]["desired_goal"].tobytes()
+    assert len({goal.tobytes() for goal in goals}) == 3
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_copies_in_mid_episode_continue_bitwise(env, duplicate):
+    chosen = actions(env, 60)
+    env.reset(seed=1)
+    roll(env, chosen[:20])
+    twin = duplicate(env)
+    expected = roll(env, chosen[20:])
+    assert_same(expected, roll(twin, chosen[20:]))
+    assert_same([env.reset()], [twin.reset()])
+
+
+def test_state_continues_bitwise_in_another_environment(env):
+    chosen = actions(env, 60)
+    env.reset(seed=1)
+    roll(env, chosen[:20])
+    state = env.unwrapped.get_state()
+    expected = roll(env.unwrapped, chosen[20:])
+    other = gym.make(env.spec.id).unwrapped
+    other.reset(seed=99)
+    roll(other, chosen[:5])
+    other.set_state(state)
+    assert_same(expected, roll(other, chosen[20:]))
+    assert_same([env.unwrapped.reset()], [other.reset()])
+
+
+def test_a_foreign_state_is_refused_and_changes_nothing(env):
+    env.reset(seed=1)
+    unwrapped = env.unwrapped
+    before = unwrapped.get_state()
+    for wrong in ({}, {**before, "tip": np.zeros((2, 7))}, {k: v for k, v in before.items() if k != "rng"}):
+        with pytest.raises(ValueError, match="state has arrays"):
+            unwrapped.set_state(wrong)
+    after = unwrapped.get_state()
+    assert all(np.array_equal(before[key], after[key]) for key in before if key != "rng")
+
+
+def test_observations_stay_in_their_finite_space(env):
+    space = env.observation_space
+    for box in space.values():
+        assert np.isfinite(box.low).all() and np.isfinite(box.high).all() and box.dtype == np.float32
+    for policy in (lambda k: np.ones(3), lambda k: -np.ones(3), lambda k: np.where(np.arange(3) == k // 34, 1, -1)):
+        observation, _ = env.reset(seed=2)
+        for k in range(100):
+            assert observation in space
+            observation, *_ = env.step(policy(k).astype(np.float32))
+        assert observation in space
+
+
+def test_rewards_are_those_of_compute_reward_for_one_goal_and_for_batches(env):
+    observation, _ = env.reset(seed=0)
+    rewards, achieved, desired = [], [], []
+    for action in actions(env, 40):
+        observation, reward, *_ = env.step(action)
+        assert type(reward) is float
+        rewards.append(reward)
+        achieved.append(observation["achieved_goal"])
+        desired.append(observation["desired_goal"])
+    batch = env.unwrapped.compute_reward(np.array(achieved), np.array(desired), None)
+    np.testing.assert_array_equal(batch, np.float32(rewards))
+    grid = env.unwrapped.compute_reward(np.array(achieved).reshape(8, 5, 3), np.array(desired).reshape(8, 5, 3), [{}])
+    np.testing.assert_array_equal(grid, np.float32(rewards).reshape(8, 5))
+
+
+def test_sparse_reward_is_zero_within_a_millimetre_only():
+    env = gym.make("TCAReach-v0").unwrapped
+    goal = np.zeros(3)
+    assert env.compute_reward(np.array([0.0999, 0.0, 0.0]), goal, {}) == 0.0
+    assert env.compute_reward(np.array([0.0, 0.0, 0.1001]), goal, {}) == -1.0
+
+
+def test_dense_reward_is_minus_the_distance_in_centimetres():
+    env = gym.make("TCAReachDense-v0").unwrapped
+    assert env.compute_reward(np.array([3.0, 4.0, 0.0]), np.zeros(3), {}) == -5.0
+
+
+def test_info_says_the_same_as_the_observation(env):
+    observation, info = env.reset(seed=0)
+    keys = {"is_success", "distance_mm", "energy_J", "cost", "solver"}
+    for action in [None, *actions(env, 20), *np.ones((30, 3), np.float32)]:
+        if action is not None:
+            observation, _, _, _, info = env.step(action)
+        assert set(info) == keys
+        assert set(info["solver"]) == {"converged", "residual", "iterations"}
+        distance = np.linalg.norm(observation["achieved_goal"].astype(float) - observation["desired_goal"])
+        assert info["distance_mm"] == pytest.approx(10.0 * distance, abs=1e-9)
+        assert info["is_success"] is bool(distance <= 0.1)
+        assert info["solver"]["converged"] is True
+        assert info["solver"]["residual"] < 1e-6
+    temperature = 25.0 + 125.0 * observation["observation"][:3].astype(float)
+    assert info["cost"] == pytest.approx(np.maximum(temperature - SOFT_LIMIT, 0.0).sum(), abs=1e-3)
+    assert info["cost"] > 0.0
+
+
+def test_energy_is_power_times_time_from_the_start_of_the_episode(env):
+    _, info = env.reset(seed=0)
+    assert info["energy_J"] == 0.0
+    *_, info = roll(env, np.zeros((5, 3), np.float32))[-1]
+    assert info["energy_J"] == pytest.approx(5 * 0.1 * 3 * 1.0)  # half of 2 W in three TCAs
+    _, info = env.reset(seed=0)
+    assert info["energy_J"] == 0.0
+
+
+def test_the_cut_off_keeps_every_tca_below_the_hard_limit(env):
+    env.reset(seed=0)
+    roll(env, np.ones((100, 3), np.float32))
+    temperature = env.unwrapped.core.record.temperature
+    np.testing.assert_allclose(temperature, core.CUT_OFF, rtol=1e-12)
+    assert temperature.max() < HARD_LIMIT
+
+
+@pytest.mark.parametrize("bad", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0], [[0, 0, 0]], 0.0])
+def test_bad_actions_are_refused_and_leave_the_episode_as_it_was(env, bad):
+    env.reset(seed=3)
+    roll(env, actions(env, 5))
+    unwrapped, twin = env.unwrapped, copy.deepcopy(env.unwrapped)
+    with pytest.raises(ValueError, match="action = "):
+        unwrapped.step(np.array(bad, dtype=np.float32))
+    assert_same(roll(twin, actions(env, 5)), roll(unwrapped, actions(env, 5)))
+
+
+def test_finite_actions_outside_the_box_are_clipped(env):
+    env.reset(seed=3)
+    twin = copy.deepcopy(env.unwrapped)
+    wild = np.array([5.0, -1e30, 0.3], dtype=np.float32)
+    assert_same([env.unwrapped.step(wild)], [twin.step(np.array([1.0, -1.0, 0.3], dtype=np.float32))])
+
+
+def test_a_failed_solve_keeps_the_last_good_state_and_truncates(env, monkeypatch):
+    env.reset(seed=3)
+    roll(env, actions(env, 5))
+    unwrapped = env.unwrapped
+    before = unwrapped.get_state()
+    observation = unwrapped._observe()
+
+    def without_answer(model, strain, tension, *rest):
+        rest[-1][:] = (collocation.FAILED, 1.0, 7)
+
+    monkeypatch.setattr(core, "solve_lanes", without_answer)
+    after, reward, terminated, truncated, info = unwrapped.step(np.ones(3, np.float32))
+    assert (terminated, truncated) == (False, True)
+    assert info["solver"] == {"converged": False, "residual": 1.0, "iterations": 7}
+    assert np.isfinite(reward)
+    for key in observation:
+        assert observation[key].tobytes() == after[key].tobytes()
+    state = unwrapped.get_state()
+    assert all(np.array_equal(before[key], state[key]) for key in before if key != "rng")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("task", "juggle"), ("reward", "golden"), ("split", "test")], ids=["task", "reward", "split"]
+)
+def test_bad_arguments_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} = '{value}': expected one of"):
+        gym.make("TCAReach-v0", **{name: value})
+
+
+def test_metadata_belongs_to_the_instance():
+    first, second = gym.make("TCAReach-v0").unwrapped, gym.make("TCAReach-v0").unwrapped
+    first.metadata["mine"] = 1
+    assert "mine" not in second.metadata
+
+
+@pytest.mark.parametrize("action", ["random", "bang-bang"])
+def test_long_rough_rides_never_fail(action):
+    env = gym.make("TCAReach-v0")
+    rng = np.random.default_rng(0)
+    for seed in range(10):
+        env.reset(seed=seed)
+        for _ in range(100):
+            powers = rng.uniform(-1, 1, 3) if action == "random" else rng.choice([-1.0, 1.0], 3)
+            observation, reward, _, _, info = env.step(powers.astype(np.float32))
+            assert info["solver"]["converged"]
+            assert np.isfinite(reward) and all(np.isfinite(x).all() for x in observation.values())
+
+
+def test_every_lane_of_a_batch_equals_the_single_environment_bitwise():
+    task = gym.make("TCAReach-v0").unwrapped.task
+    many, rng = task.core(7), np.random.default_rng(0)
+    singles = [task.core(1) for _ in range(7)]
+    for _ in range(20):
+        powers = rng.uniform(-1, 1, (7, 3))
+        report = many.step(powers)
+        for i, single in enumerate(singles):
+            alone = single.step(powers[i : i + 1])
+            assert alone.tobytes() == report[i : i + 1].tobytes()
+            assert task.observe(single).tobytes() == task.observe(many)[i : i + 1].tobytes()
+            assert single.record.strain.tobytes() == many.record.strain[i : i + 1].tobytes()

@@ -1,0 +1,65 @@
+"""Goals of Reach: reachable, held out where they should be, and the same for everybody."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import tca_envs  # noqa: F401
+from tca_envs.mechanics import thermal
+from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT
+from tca_envs.tasks.core import STEP_S
+from tca_envs.tasks.reach import Reach, held_out
+
+
+def test_a_goal_is_the_tip_that_steady_powers_reach():
+    task = Reach("train")
+    core = task.core(1)
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        temperature = rng.uniform(AMBIENT, SOFT_LIMIT, 3)
+        settled, good = core.settle(temperature[np.newaxis])
+        assert good.all()
+        core.reset(np.array([0]), np.zeros((1, 3)))
+        action = 2.0 * thermal.steady_power(temperature, core.heating) / core.heating.max_power - 1.0
+        for _ in range(int(40.0 / STEP_S)):
+            core.step(action[np.newaxis])
+        np.testing.assert_allclose(task.achieved(core.record), task.achieved(settled), atol=1e-5)
+
+
+def test_splits_are_a_fifth_and_disjoint():
+    rng = np.random.default_rng(0)
+    share = np.mean([held_out(rng.uniform(AMBIENT, SOFT_LIMIT, 3)) for _ in range(20_000)])
+    assert share == pytest.approx(0.2, abs=0.02)
+
+
+@pytest.mark.parametrize("split", ["train", "held-out"])
+def test_goals_come_from_their_split(split, monkeypatch):
+    task = Reach(split)
+    core = task.core(1)
+    drawn = []
+    settle = core.settle
+
+    def remember(temperature):
+        drawn.append(temperature[0].copy())
+        return settle(temperature)
+
+    monkeypatch.setattr(core, "settle", remember)
+    task.draw_goals(core, np.random.default_rng(0), 30)
+    assert len(drawn) == 30
+    assert all(held_out(temperature) == (split == "held-out") for temperature in drawn)
+
+
+def test_goals_do_not_depend_on_the_episode_before():
+    env = gym.make("TCAReach-v0", split="held-out")
+    goals = [env.reset(seed=seed)[0]["desired_goal"] for seed in (1, 2, 1)]
+    assert goals[0].tobytes() == goals[2].tobytes() != goals[1].tobytes()
+
+
+def test_the_arm_hangs_straight_at_the_start_and_bends_towards_a_hot_tca():
+    env = gym.make("TCAReach-v0")
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_allclose(observation["achieved_goal"][:2], 0.0, atol=1e-6)
+    for _ in range(50):
+        observation, *_ = env.step(np.array([1.0, -1.0, -1.0], np.float32))
+    x, y, z = observation["achieved_goal"]
+    assert x > 0.5 and abs(y) < 1e-4 and z < 4.5
