@@ -50,13 +50,12 @@ class Report:
 def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
     """Return the 95 % Wilson score interval of a proportion (Wilson 1927)."""
     if trials < 1 or not 0 <= successes <= trials:
-        raise ValueError(
-            f"successes = {successes!r}, trials = {trials!r}: expected 0 <= successes <= trials, trials >= 1"
-        )
+        raise ValueError(f"successes = {successes!r}, trials = {trials!r}: expected 0 <= successes <= trials, trials >= 1")
     p, n = successes / trials, trials
     centre = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, centre - half), min(1.0, centre + half)
+    # At 0 and n the exact bounds are 0 and 1; round-off would miss them.
+    return 0.0 if successes == 0 else centre - half, 1.0 if successes == trials else centre + half
 
 
 def evaluate(

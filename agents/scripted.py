@@ -24,8 +24,7 @@ class ReachController:
     """Plan the temperatures that put the tip on the goal, then drive each TCA there.
 
     The plan is Gauss-Newton on the arm's model with `tip_jacobian`, anew for every new goal. The drive is feed-forward
-    and feedback in one: the power that takes the measured temperature to the planned one in a step, as far as the heater
-    can.
+    and feedback in one: the power that takes the measured temperature to the next one in a step, all TCAs keeping pace.
     """
 
     def __init__(self) -> None:
@@ -46,9 +45,21 @@ class ReachController:
         if self.goal is None or not np.array_equal(goal, self.goal):
             self.goal, self.target = goal, plan(self.arm, goal / 100.0)
         temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * np.asarray(observation["observation"][:3], dtype=np.float64)
-        power = thermal.power_to_reach(temperature, self.target, STEP_S, self.heating)
+        waypoint = self._waypoint(temperature)
+        power = thermal.power_to_reach(temperature, waypoint, STEP_S, self.heating)
         action = 2.0 * np.clip(power / self.heating.max_power, 0.0, 1.0) - 1.0
         return action.astype(np.float32), None
+
+    def _waypoint(self, temperature: Array) -> Array:
+        """Return the temperatures to aim at next, on the straight way from ambient to the target.
+
+        The TCA that needs longest sets the pace, so nothing is lost, and the arm comes to the equilibrium that slow heating
+        leads to: with one TCA near 150 degC it has others, buckled to the other side.
+        """
+        rise = self.target - AMBIENT
+        reachable = thermal.step(temperature, self.heating.max_power, STEP_S, self.heating) - AMBIENT
+        share = min([1.0, *(reachable[rise > 0.0] / rise[rise > 0.0])])
+        return AMBIENT + share * rise
 
 
 def plan(arm: Arm, goal: Array) -> Array:
@@ -95,13 +106,14 @@ def _gauss_newton(arm: Arm, goal: Array, start: Array) -> tuple[Array, float]:
             break
         else:
             damping *= 5.0
-    return temperature, float(np.linalg.norm(error))
+    # Newton's way may have led to an equilibrium that heating does not lead to.
+    return temperature, float(np.linalg.norm(goal - _steady(arm, temperature).tip_pose[:3, 3]))
 
 
 def _steady(arm: Arm, temperature: Array) -> Equilibrium:
     """Return the equilibrium that slow heating from ambient to `temperature` reaches."""
     here = arm.equilibrium(np.full(len(temperature), AMBIENT))
-    for part in (0.5, 1.0):
+    for part in np.linspace(0.1, 1.0, 10):
         here = arm.equilibrium(AMBIENT + part * (temperature - AMBIENT), start=here)
     return here
 

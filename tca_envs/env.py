@@ -15,7 +15,7 @@ from tca_envs.tasks import TASKS
 REWARDS = ("sparse", "dense")
 
 
-class ArmEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
+class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
     """One arm with one task; the task's docstring (`tca_envs.tasks`) documents spaces, rewards and episodes.
 
     Parameters
@@ -44,7 +44,7 @@ class ArmEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
         self.core = self.task.core(1)
         size = len(self.core.arm.muscles)
         self.action_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
-        self.observation_space: spaces.Dict = spaces.Dict(
+        self.observation_space = spaces.Dict(
             {
                 "observation": self.task.observation_space,
                 "achieved_goal": self.task.goal_space,

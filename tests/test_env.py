@@ -122,7 +122,7 @@ def test_a_foreign_state_is_refused_and_changes_nothing(env):
     env.reset(seed=1)
     unwrapped = env.unwrapped
     before = unwrapped.get_state()
-    for wrong in ({}, {**before, "tip": np.zeros((2, 7))}, {k: v for k, v in before.items() if k != "rng"}):
+    for wrong in ({}, {**before, "tip": np.zeros((2, 4, 4))}, {k: v for k, v in before.items() if k != "rng"}):
         with pytest.raises(ValueError, match="state has arrays"):
             unwrapped.set_state(wrong)
     after = unwrapped.get_state()

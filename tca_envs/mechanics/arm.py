@@ -25,6 +25,8 @@ from tca_envs.mechanics.muscle import PARAMETERS, Muscle
 Array = NDArray[np.float64]
 ArrayOf3 = tuple[float, float, float]
 ZERO: ArrayOf3 = (0.0, 0.0, 0.0)
+EYE = np.eye(4)[np.newaxis]
+HOW = {SUBSTEPS: " in substeps of drive and load", FALL: " after a fall from the end of the start's branch"}
 STRAIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -62,14 +64,10 @@ class Module:
         object.__setattr__(self, "length", check.scalar("length", self.length, 0.0, above=True))
         stiffness = check.array("stiffness", self.stiffness, (6,))
         if not (stiffness > 0.0).all():
-            raise ValueError(
-                f"stiffness = {self.stiffness!r}: expected six positive numbers EI_x, EI_y, GJ, GA, GA, EA"
-            )
+            raise ValueError(f"stiffness = {self.stiffness!r}: expected six positive numbers EI_x, EI_y, GJ, GA, GA, EA")
         reference = check.array("reference_strain", self.reference_strain, (6,))
         if not reference[5] > 0.0:
-            raise ValueError(
-                f"reference_strain = {self.reference_strain!r}: expected v*_z > 0, the rod's own direction"
-            )
+            raise ValueError(f"reference_strain = {self.reference_strain!r}: expected v*_z > 0, the rod's own direction")
         object.__setattr__(self, "mass_per_length", check.scalar("mass_per_length", self.mass_per_length, 0.0))
         try:
             muscles = tuple(self.muscles)
@@ -243,9 +241,7 @@ class Arm:
         if payload is not None and not isinstance(payload, Payload):
             raise ValueError(f"payload = {payload!r}: expected a Payload or None")
         self.payload = payload
-        self.grids = (
-            tuple(default_grid(m) for m in self.modules) if grids is None else _checked(grids, len(self.modules))
-        )
+        self.grids = tuple(default_grid(m) for m in self.modules) if grids is None else _checked(grids, len(self.modules))
         self.tolerance = check.scalar("tolerance", tolerance, 1e-12, 1e-3)
         self.length = sum(module.length for module in self.modules)
         self.muscles = tuple(muscle for module in self.modules for muscle in module.muscles)
@@ -317,22 +313,21 @@ class Arm:
             strain, tension, from_drive, from_load = self.unloaded()
         else:
             strain, tension, from_drive, from_load = self._restart(start)
-        tip, lengths, report = np.empty((1, 7)), np.empty((1, drive.size)), np.empty((1, 3))
+        tip, lengths, report = EYE.copy(), np.empty((1, drive.size)), np.empty((1, 3))
         lanes = [values[np.newaxis] for values in (strain, tension, from_drive, from_load, drive, load)]
         solve_lanes(self.model, *lanes, tip, lengths, report)
         rung, residual, iterations = report[0].tolist()
         converged = rung != FAILED
         if converged:
-            how = {SUBSTEPS: " in substeps of drive and load", FALL: " after a fall from the end of the start's branch"}
-            message = f"converged below {self.tolerance:g}" + how.get(rung, "")
+            message = f"converged below {self.tolerance:g}" + HOW.get(rung, "")
         else:
             message = "no equilibrium found by Newton, substeps or a damped fall; this is the start's shape"
             ends, _, position, _, _, lengths[0] = shape(self.model, strain, tension, from_drive, from_load)
-            tip[0, :4], tip[0, 4:] = ends[-1], position[-1]
+            tip[0] = pose(ends[-1], position[-1])
         # Where there is no answer, from_drive and from_load still are the start's.
         state = (strain, tension, from_drive, from_load)
         return Equilibrium(
-            tip_pose=pose(tip[0, :4], tip[0, 4:]),
+            tip_pose=tip[0],
             tensions=tension,
             muscle_lengths=lengths[0],
             drive=drive,
@@ -350,9 +345,8 @@ class Arm:
     def checked_drive(self, drive: ArrayLike) -> Array:
         """Return `drive` as (n,) floats; ValueError for a wrong shape, non-finite numbers or values out of a law's range."""
         result = check.array("drive", drive, (len(self.muscles),))
-        outside = (result < self._lowest) | (result > self._highest)
-        if outside.any():
-            i = int(np.argmax(outside))
+        if not (np.minimum(np.maximum(result, self._lowest), self._highest) == result).all():
+            i = int(np.argmax((result < self._lowest) | (result > self._highest)))
             raise ValueError(
                 f"drive[{i}] = {result[i]:g}: expected a value in [{self._lowest[i]:g}, {self._highest[i]:g}] for "
                 f"{type(self.muscles[i].law).__name__}"
@@ -389,9 +383,7 @@ class _Sampler:
 
     def __call__(self, s: Array) -> tuple[Array, Array]:
         arm, model = self.arm, self.arm.model
-        ends, quaternion, position, tangent, spin, _ = shape(
-            model, self.strain, self.tension.copy(), self.drive, self.load
-        )
+        ends, quaternion, position, tangent, spin, _ = shape(model, self.strain, self.tension.copy(), self.drive, self.load)
         rotation = pose(ends[-1], position[-1])[:3, :3]
         force_tip = self.load[0:3] + self.load[9] * self.load[6:9]
         moment = self.load[3:6] + np.cross(rotation @ self.load[10:13], self.load[9] * self.load[6:9])

@@ -765,8 +765,8 @@ def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip,
         In: where (strain, tension) are in equilibrium. Out: the asked ones; unchanged where there was none.
     drive, load : (N, n), (N, LOAD) arrays
         What is asked.
-    tip : (N, 7) array
-        Out: tip quaternion and position [m]; unchanged where there was no answer.
+    tip : (N, 4, 4) array
+        Out: tip poses [m], but for the last row, which stays; unchanged where there was no answer.
     lengths : (N, n) array
         Out: path lengths [m]; unchanged where there was no answer.
     report : (N, 3) array
@@ -780,8 +780,12 @@ def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip,
         report[lane, 0], report[lane, 1], report[lane, 2] = rung, worst, iterations
         if rung == FAILED:
             continue
-        tip[lane, :4] = ws.ends[-1]
-        tip[lane, 4:] = ws.position[-1]
+        r = rotation_matrix(get4(ws.ends, ws.ends.shape[0] - 1))
+        pose = tip[lane]
+        put3(pose, 0, 0, (r[0], r[1], r[2]))
+        put3(pose, 1, 0, (r[3], r[4], r[5]))
+        put3(pose, 2, 0, (r[6], r[7], r[8]))
+        pose[:3, 3] = ws.position[-1]
         lengths[lane] = ws.length
         from_drive[lane] = drive[lane]
         from_load[lane] = load[lane]

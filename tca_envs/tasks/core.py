@@ -20,6 +20,11 @@ STEP_S = 0.1
 CUT_OFF = 158.0
 """Temperature [degC] that the heaters' firmware never lets a TCA exceed: below the hard limit of 160 degC."""
 
+RAMPS = (5, 16)
+"""Coarse and fine steps in which `Core.settle` heats."""
+SAME_TIP = 1e-5
+"""Tips within this distance [m] are the same equilibrium."""
+
 
 @dataclass
 class Record:
@@ -40,7 +45,7 @@ class Record:
     load: Array
     """(N, LOAD) load at which they are."""
     tip: Array
-    """(N, 7) quaternion and position [m] of the tip."""
+    """(N, 4, 4) pose of the tip [m]."""
     length: Array
     """(N, n) path lengths of the muscles [m]."""
     goal: Array
@@ -78,6 +83,7 @@ class Core:
     def __init__(self, arm: Arm, heater: Heater, lanes: int, goal_size: int) -> None:
         self.arm = arm
         self.heating = heater.scaled(arm.rest_lengths)
+        self._load = arm.load()[np.newaxis]
         self.rest = self._rest(goal_size)
         self.record = self.rest.rows(np.zeros(lanes, dtype=np.intp))
 
@@ -86,7 +92,7 @@ class Core:
         n = len(self.arm.muscles)
         temperature = np.full((1, n), self.heating.ambient)
         strain, tension, drive, load = (values[np.newaxis] for values in self.arm.unloaded())
-        tip, length = np.zeros((1, 7)), np.zeros((1, n))
+        tip, length = np.eye(4)[np.newaxis].copy(), np.zeros((1, n))
         record = Record(
             temperature,
             np.zeros((1, n)),
@@ -107,7 +113,7 @@ class Core:
     def _solve(self, record: Record, temperature: Array) -> Array:
         """Bring lanes to equilibrium at `temperature`; where there is none, keep them as they are. Returns (N, 3)."""
         report = np.empty((len(temperature), 3))
-        load = np.broadcast_to(self.arm.load(), record.load.shape).copy()
+        load = np.repeat(self._load, len(temperature), axis=0)
         solve_lanes(
             self.arm.model, record.strain, record.tension, record.drive, record.load, temperature, load,
             record.tip, record.length, report,
@@ -147,8 +153,8 @@ class Core:
     def settle(self, temperature: Array) -> tuple[Record, NDArray[np.bool_]]:
         """Heat arms from rest to steady temperatures, as constant powers do.
 
-        The way there is part of the answer: a soft arm can have several equilibria at the same temperatures, and this is
-        the one that it reaches.
+        The way there is part of the answer: near 150 degC an arm with one hot TCA has several equilibria, because it can
+        buckle to either side. Each way is taken in coarse and in fine steps; where these end apart, so could an arm.
 
         Parameters
         ----------
@@ -158,11 +164,15 @@ class Core:
         Returns
         -------
         tuple
-            The settled lanes and whether each one got there, (N,).
+            The settled lanes and whether each one's end is beyond doubt, (N,).
         """
-        record = self.rest.rows(np.zeros(len(temperature), dtype=np.intp))
         good = np.ones(len(temperature), dtype=bool)
-        for done in (0.3, 0.5, 0.7, 0.85, 0.95, 1.0):
-            report = self._solve(record, self.heating.ambient + done * (temperature - self.heating.ambient))
-            good &= report[:, 0] != FAILED
+        tips = []
+        for steps in RAMPS:
+            record = self.rest.rows(np.zeros(len(temperature), dtype=np.intp))
+            for done in np.arange(1, steps + 1) / steps:
+                report = self._solve(record, self.heating.ambient + done * (temperature - self.heating.ambient))
+                good &= report[:, 0] != FAILED
+            tips.append(record.tip[:, :3, 3])
+        good &= np.linalg.norm(tips[0] - tips[1], axis=1) < SAME_TIP
         return record, good

@@ -1,0 +1,139 @@
+"""The command line of train.py: it learns, saves, goes on, evaluates, and says what is wrong."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import matplotlib.image
+import pytest
+from stable_baselines3 import PPO, SAC
+
+import train
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(*arguments, cwd=ROOT, **options):
+    command = [sys.executable, str(ROOT / "train.py"), *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, **options)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A short run by the command line."""
+    folder = tmp_path_factory.mktemp("runs") / "short"
+    done = run("--steps", 1200, "--seed", 3, "--episodes", 2, "--out", folder)
+    assert done.returncode == 0, done.stderr
+    return folder, done
+
+
+def test_a_run_leaves_policy_curve_and_report(trained):
+    folder, done = trained
+    for name in ("policy.zip", "policy.json", "last.zip", "replay_buffer.pkl", "curve.csv", "curve.png", "report.json"):
+        assert (folder / name).stat().st_size > 0
+    assert matplotlib.image.imread(folder / "curve.png").shape[0] > 400
+    with (folder / "curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert int(float(rows[-1]["steps"])) == 1200
+    report = json.loads((folder / "report.json").read_text())
+    assert set(report["held_out"]) == {"sac", "scripted", "random"}
+    assert report["held_out"]["scripted"]["success_rate"] == 1.0
+    assert report["seed"] == 3 and report["versions"]["gymnasium"]
+    for name in ("sac", "scripted", "random"):
+        assert f"{name}: success" in done.stdout
+
+
+def test_progress_is_shown(trained):
+    _, done = trained
+    assert "1200/1,200" in (done.stdout + done.stderr).replace("1,200/1,200", "1200/1,200")
+
+
+def test_eval_only_repeats_the_reports_numbers(trained):
+    folder, _ = trained
+    done = run("--eval-only", folder, "--episodes", 2)
+    assert done.returncode == 0, done.stderr
+    report, again = (json.loads((folder / name).read_text()) for name in ("report.json", "evaluation.json"))
+    assert report["held_out"] == again["held_out"]
+
+
+def test_resume_goes_on(trained):
+    folder, _ = trained
+    done = run("--resume", folder, "--steps", 400, "--episodes", 1)
+    assert done.returncode == 0, done.stderr
+    with (folder / "curve.csv").open() as file:
+        steps = [int(float(row["steps"])) for row in csv.DictReader(file)]
+    assert steps == sorted(steps) and steps[-1] == 1600
+
+
+def test_ctrl_c_saves_what_there_is(tmp_path):
+    folder = tmp_path / "stopped"
+    command = [sys.executable, str(ROOT / "train.py"), "--steps", "1000000", "--out", str(folder)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        while not (folder / "policy.json").exists():
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.1)
+        time.sleep(3.0)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=120)
+    assert process.returncode == 130, err
+    assert f"python train.py --resume {folder}" in out
+    for name in ("policy.zip", "last.zip", "curve.csv"):
+        assert (folder / name).exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--task", "juggle"], "--task juggle: unknown; the tasks are reach"),
+        (["--algo", "dqn"], "--algo dqn: unknown; the algorithms are sac, ppo, td3"),
+        (["--steps", "0"], "--steps 0: expected a positive integer"),
+        (["--episodes", "-3"], "--episodes -3: expected a positive integer"),
+        (["--seed", "-1"], "--seed -1: expected an integer of at least 0"),
+        (["--eval-only", "nowhere"], "nowhere: expected the folder of a run"),
+        (["--resume", "a", "--eval-only", "b"], "exclude each other"),
+    ],
+)
+def test_bad_arguments_are_told(arguments, message, capsys):
+    with pytest.raises(SystemExit) as stop:
+        train.main(arguments)
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def checkpoint(folder, model, task="reach", algo="sac"):
+    folder.mkdir()
+    model.save(folder / "policy.zip")
+    (folder / "policy.json").write_text(json.dumps({"task": task, "algo": algo}))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("make", "described", "arguments", "message"),
+    [
+        (lambda: SAC("MlpPolicy", gym.make("Pendulum-v1")), {}, [], "made for the observation_space"),
+        (lambda: PPO("MlpPolicy", gym.make("Pendulum-v1"), device="cpu"), {}, [], "expected a sac policy"),
+        (lambda: SAC("MlpPolicy", gym.make("Pendulum-v1")), {"task": "juggle"}, [], "'juggle' with 'sac' is unknown"),
+        (lambda: SAC("MlpPolicy", gym.make("Pendulum-v1")), {}, ["--algo", "ppo"], "holds a policy of 'sac', not 'ppo'"),
+    ],
+)
+def test_foreign_checkpoints_are_told(make, described, arguments, message, tmp_path, capsys):
+    folder = checkpoint(tmp_path / "run", make(), **described)
+    with pytest.raises(SystemExit) as stop:
+        train.main(["--eval-only", str(folder), *arguments])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_broken_checkpoint_is_told(tmp_path, capsys):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "policy.json").write_text('{"task": "reach", "algo": "sac"}')
+    (folder / "policy.zip").write_text("not a zip")
+    with pytest.raises(SystemExit):
+        train.main(["--eval-only", str(folder)])
+    assert "expected a sac policy" in capsys.readouterr().err
