@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import ceil, hypot
+from operator import index as as_integer
 from typing import NamedTuple
 
 import numpy as np
@@ -141,8 +142,9 @@ class Module:
 
     def rest_length(self, muscle: Muscle, nodes: int = 64) -> float:
         """Return the path length of a muscle in the unloaded rod [m], l* of eq. (24), by Gauss quadrature."""
-        _, weights, points = gauss(nodes)
-        return self.length * float(sum(w * self._stretch(muscle, x) for w, x in zip(weights, points, strict=True)))
+        points, weights = np.polynomial.legendre.leggauss(nodes)
+        stretches = [self._stretch(muscle, x) for x in (points + 1.0) / 2.0]
+        return 0.5 * self.length * float(weights @ stretches)
 
 
 @dataclass(frozen=True)
@@ -304,7 +306,7 @@ class Arm:
 
         Notes
         -----
-        Gauss collocation of the strain with damped Newton, then substeps in drive and load, then a damped fall; see
+        Gauss collocation of the strain with Newton, then substeps in drive and load, then a damped fall; see
         `collocation`.
         """
         drive = self.checked_drive(drive)
@@ -466,14 +468,13 @@ def _vector(name: str, value: ArrayLike) -> ArrayLike:
 
 
 def _checked(grids: Sequence[Grid], modules: int) -> tuple[Grid, ...]:
+    expected = f"{modules} of Grid(elements >= 1, nodes in 1..{MAX_NODES}), one for each module"
     try:
-        result = tuple(Grid(*(int(n) for n in grid)) for grid in grids)
+        result = tuple(Grid(*(as_integer(n) for n in grid)) for grid in grids)
     except TypeError:
-        raise ValueError(f"grids = {grids!r}: expected one Grid(elements, nodes) for each module") from None
+        raise ValueError(f"grids = {grids!r}: expected {expected}") from None
     if len(result) != modules or any(g.elements < 1 or not 1 <= g.nodes <= MAX_NODES for g in result):
-        raise ValueError(
-            f"grids = {grids!r}: expected {modules} of Grid(elements >= 1, nodes in 1..{MAX_NODES}), one for each module"
-        )
+        raise ValueError(f"grids = {grids!r}: expected {expected}")
     return result
 
 

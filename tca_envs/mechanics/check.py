@@ -22,9 +22,12 @@ def array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArray
     """Return a float64 copy of `value`, finite and of `shape` (None: any size); ValueError otherwise."""
     expected = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
     try:
-        result = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} = {value!r}: expected finite numbers of shape {expected}") from None
+        given = np.asarray(value)
+    except ValueError:  # ragged
+        given = np.empty(0, dtype=object)
+    if given.dtype.kind not in "iuf":  # not booleans, strings or complex numbers, which NumPy would convert
+        raise ValueError(f"{name} = {value!r}: expected finite numbers of shape {expected}")
+    result = np.array(given, dtype=np.float64)
     if result.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, result.shape, strict=True)):
         raise ValueError(f"{name} = {value!r} has shape {result.shape}: expected shape {expected}")
     if not np.isfinite(result).all():

@@ -74,7 +74,7 @@ class Equilibrium:
         return self.differentiate()
 
     def _arc(self, s: ArrayLike) -> Array:
-        positions = check.array("s", np.atleast_1d(np.asarray(s, dtype=float)), (None,))
+        positions = check.array("s", [s] if isinstance(s, int | float) else s, (None,))
         if positions.size and (positions.min() < 0.0 or positions.max() > self.length * (1.0 + 1e-12)):
             raise ValueError(f"s = {s!r}: expected arc positions in [0, {self.length:g}] m")
         return np.minimum(positions, self.length)

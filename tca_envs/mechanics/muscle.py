@@ -242,5 +242,5 @@ class Muscle:
         check.scalar("offset", self.offset, 0.0)
         check.scalar("angle", self.angle)
         check.scalar("turns", self.turns, -1000.0, 1000.0)
-        if not isinstance(getattr(self.law, "kind", None), int):
+        if isinstance(self.law, type) or not isinstance(getattr(self.law, "kind", None), int):
             raise ValueError(f"law = {self.law!r}: expected a muscle law such as TCA(), Tendon() or Spring(rate)")
