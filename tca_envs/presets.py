@@ -34,8 +34,6 @@ GRIPPER_MASS = 0.9e-3
 BELOW_BENDING = Payload(TWISTING_MASS + GRIPPER_MASS, (0.0, 0.0, 12e-3))
 """Twisting module and gripper as a rigid body: centre of mass 12 mm below the bending module's tip (estimate)."""
 
-TCA_PRESETS = {"hardware": TCA.hardware(), "paper": TCA.paper()}
-
 
 def bending_module(tca: TCA | None = None) -> Module:
     """Return the paper's 3D bending module: three straight TCAs around a soft cylinder."""

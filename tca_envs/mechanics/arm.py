@@ -364,8 +364,8 @@ class Arm:
                 f"arm, with {len(self.muscles)} and {self.length:g} m"
             )
         # A failed solve holds the shape of its own start, so that is where the substeps begin.
-        source = start.sample if isinstance(start.sample, _Sampler) else None
-        from_drive, from_load = (source.drive, source.load) if source else (start.drive, start.load)
+        from_drive = getattr(start.sample, "drive", start.drive)
+        from_load = getattr(start.sample, "load", start.load)
         if start.nodes is not None and start.nodes[0] is self.model:
             strain = start.nodes[1].copy()
         else:

@@ -20,16 +20,21 @@ def scalar(name: str, value: Any, low: float = -np.inf, high: float = np.inf, ab
 
 def array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
     """Return a float64 copy of `value`, finite and of `shape` (None: any size); ValueError otherwise."""
-    expected = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
     try:
         given = np.asarray(value)
     except ValueError:  # ragged
         given = np.empty(0, dtype=object)
     if given.dtype.kind not in "iuf":  # not booleans, strings or complex numbers, which NumPy would convert
-        raise ValueError(f"{name} = {value!r}: expected finite numbers of shape {expected}")
+        raise ValueError(f"{name} = {value!r}: expected finite numbers of shape {_written(shape)}")
     result = np.array(given, dtype=np.float64)
-    if result.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, result.shape, strict=True)):
-        raise ValueError(f"{name} = {value!r} has shape {result.shape}: expected shape {expected}")
+    if result.shape != shape and (
+        result.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, result.shape, strict=True))
+    ):
+        raise ValueError(f"{name} = {value!r} has shape {result.shape}: expected shape {_written(shape)}")
     if not np.isfinite(result).all():
         raise ValueError(f"{name} = {value!r}: expected finite numbers")
     return result
+
+
+def _written(shape: tuple[int | None, ...]) -> str:
+    return "(" + ", ".join("any" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
