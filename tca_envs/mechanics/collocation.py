@@ -414,9 +414,17 @@ def eliminate(model, strain, tension, load, damping, ws):
             g0 -= q
             for j in range(q):
                 _section(model, k, g0 + j, tension, strain, damping, ws)
+            inside = g0 > 0  # nothing turns the arm's own base: there phi_0 is zero and row 0 is of no use
             p_new = zero
             for r in range(q + 1):  # row 0: the base; rows 1..q: the nodes
                 row = g0 + r - 1
+                if r == 0 and not inside:
+                    for l in range(q):
+                        put9(base, g0 + l, zero)
+                        put9(phi, g0 + l, zero)
+                    for c in range(mk):
+                        put3(handed, new_q + c, 0, ORIGIN)
+                    continue
                 for l in range(q):
                     block = axpy9(h * b[k, l], p_end, zero)
                     for kk in range(q):
@@ -431,14 +439,15 @@ def eliminate(model, strain, tension, load, damping, ws):
                     if l == r - 1:
                         block = axpy9(1.0, get9(ws.m_block, row), block)
                     put9(matrix, row * wide + l, block)
-                block = p_end
-                for kk in range(q):
-                    late = b[k, kk] if r == 0 else b[k, kk] - a[k, r - 1, kk]
-                    block = axpy9(h * late, get9(x_block, g0 + kk), block)
-                if r == 0:
-                    p_new = block
-                else:
-                    put9(phi, row, axpy9(-1.0, get9(n_block, row), block))
+                if inside:
+                    block = p_end
+                    for kk in range(q):
+                        late = b[k, kk] if r == 0 else b[k, kk] - a[k, r - 1, kk]
+                        block = axpy9(h * late, get9(x_block, g0 + kk), block)
+                    if r == 0:
+                        p_new = block
+                    else:
+                        put9(phi, row, axpy9(-1.0, get9(n_block, row), block))
                 for c in range(mk):
                     x = get3(handed, big_q + c, 0)
                     for kk in range(q):
@@ -463,7 +472,7 @@ def eliminate(model, strain, tension, load, damping, ws):
                     for j in range(q):
                         t, t2 = get3(ws.wrench, g0 + j, 6 * c + 3), get3(ws.wrench, g0 + j, 6 * c2 + 3)
                         beta[c, c2] -= h * b[k, j] * dot(t, apply(get9(ws.compliance, g0 + j), t2))
-            _factorise_blocks(matrix, phi, pulled, g0, q, wide, mk)
+            _factorise_blocks(matrix, phi, pulled, inside, g0, q, wide, mk)
             for l in range(g0, g0 + q):
                 p_new = axpy9(1.0, matmul(get9(base, l), get9(phi, l)), p_new)
                 for c in range(mk):
@@ -498,8 +507,8 @@ def eliminate(model, strain, tension, load, damping, ws):
 
 
 @inner
-def _factorise_blocks(matrix, phi, pulled, g0, q, wide, mk):
-    """LU without pivoting, in 3 x 3 blocks, of an element's matrix; `phi` and `pulled` become the solutions.
+def _factorise_blocks(matrix, phi, pulled, inside, g0, q, wide, mk):
+    """LU without pivoting, in 3 x 3 blocks, of an element's matrix; `phi` (if `inside`) and `pulled` become the solutions.
 
     At a stable equilibrium the matrix is positive definite up to a diagonal scaling, so pivoting buys nothing; where it is
     singular the answer is not finite. Diagonal blocks are stored inverted.
@@ -516,16 +525,18 @@ def _factorise_blocks(matrix, phi, pulled, g0, q, wide, mk):
             for j in range(k + 1, q):
                 product = matmul(factor, get9(matrix, row_k + j))
                 put9(matrix, row_i + j, axpy9(-1.0, product, get9(matrix, row_i + j)))
-            put9(phi, g0 + i, axpy9(-1.0, matmul(factor, phi_k), get9(phi, g0 + i)))
+            if inside:
+                put9(phi, g0 + i, axpy9(-1.0, matmul(factor, phi_k), get9(phi, g0 + i)))
             for c in range(mk):
                 x = apply(factor, get3(pulled, g0 + k, 3 * c))
                 put3(pulled, g0 + i, 3 * c, axpy(-1.0, x, get3(pulled, g0 + i, 3 * c)))
     for k in range(q - 1, -1, -1):
         row_k = (g0 + k) * wide
-        block = get9(phi, g0 + k)
-        for l in range(k + 1, q):
-            block = axpy9(-1.0, matmul(get9(matrix, row_k + l), get9(phi, g0 + l)), block)
-        put9(phi, g0 + k, matmul(get9(matrix, row_k + k), block))
+        if inside:
+            block = get9(phi, g0 + k)
+            for l in range(k + 1, q):
+                block = axpy9(-1.0, matmul(get9(matrix, row_k + l), get9(phi, g0 + l)), block)
+            put9(phi, g0 + k, matmul(get9(matrix, row_k + k), block))
         for c in range(mk):
             x = get3(pulled, g0 + k, 3 * c)
             for l in range(k + 1, q):
