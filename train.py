@@ -25,6 +25,9 @@ from agents.scripted import CONTROLLERS, RandomPolicy
 
 EVALUATION_SEED = 1_000_000
 """Held-out goals are drawn with seeds from here on."""
+ARTEFACTS = (
+    "policy.zip", "policy.json", "last.zip", "replay_buffer.pkl", "curve.csv", "curve.png", "report.json", "evaluation.json",
+)  # fmt: skip
 CURVE_SEED = 2_000_000
 """Goals of the learning curve, of the training split, are drawn with seeds from here on."""
 CURVE_EPISODES = 30
@@ -46,6 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
         if algorithm is not None and algorithm != description["algo"]:
             fail(f"{source} holds a policy of {description['algo']!r}, not {algorithm!r}")
         algorithm = description["algo"]
+        options.seed = description.get("seed", options.seed)
     task = task or "reach"
     algorithm = algorithm or DEFAULT_ALGORITHM[task]
     settings = dict(HYPERPARAMETERS[task][algorithm])
@@ -65,6 +69,9 @@ def main(arguments: list[str] | None = None) -> int:
     seconds = 0.0
     if not options.eval_only:
         folder.mkdir(parents=True, exist_ok=True)
+        if not options.resume:
+            for name in ARTEFACTS:  # of an earlier run in the same folder
+                (folder / name).unlink(missing_ok=True)
         seconds, interrupted = train(model, task, algorithm, settings, options, folder)
         print(f"saved the policy, curve.csv and curve.png in {folder}")
         if interrupted:
@@ -94,7 +101,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Train and evaluate policies on the TCA arm.")
     parser.add_argument("--task", help=f"one of {', '.join(HYPERPARAMETERS)} (default: reach)")
     parser.add_argument("--algo", help=f"one of {', '.join(ALGORITHMS)} (default: the task's best)")
-    parser.add_argument("--steps", type=int, help="environment steps to train (default: the task's)")
+    parser.add_argument("--steps", type=int, help="environment steps to train, with --resume in addition (default: the task's)")
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
     parser.add_argument("--out", type=Path, help="folder of the run (default: runs/TASK-ALGO-seedS)")
     parser.add_argument("--eval-only", type=Path, metavar="PATH", help="evaluate the run in this folder")
@@ -131,6 +138,8 @@ def read_description(folder: Path) -> dict[str, Any]:
         description = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         fail(f"{folder}: expected the folder of a run, with policy.zip and policy.json ({error})")
+    if not isinstance(description, dict):
+        fail(f"{path}: expected an object with task and algo")
     if description.get("task") not in HYPERPARAMETERS or description.get("algo") not in ALGORITHMS:
         fail(
             f"{path}: task {description.get('task')!r} with {description.get('algo')!r} is unknown; the tasks are "
@@ -167,7 +176,7 @@ def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse
         model = learner(algorithm).load(path, device=options.device)
     except Exception as error:  # SB3 passes on whatever torch, pickle and zipfile raise
         fail(f"{path}: expected a {algorithm} policy that this version of stable-baselines3 reads ({error})")
-    env = environments(settings, options.seed)
+    env = environments(settings, options.seed + model.num_timesteps)  # goals go on, not again
     for name in ("observation_space", "action_space"):
         if getattr(model, name) != getattr(env, name):
             fail(f"{path}: made for the {name} {getattr(model, name)}, but {settings['env']} has {getattr(env, name)}")

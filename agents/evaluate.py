@@ -20,7 +20,7 @@ class Policy(Protocol):
 
 @dataclass(frozen=True)
 class Report:
-    """Result of `evaluate`. An episode succeeds if its last step does: the goal must be held."""
+    """Result of `evaluate`. An episode succeeds if its last step does, by a converged solve: the goal must be held."""
 
     episodes: int
     successes: int
@@ -104,9 +104,10 @@ def evaluate(
             steps += 1
             if not info["is_success"]:
                 held_since = steps + 1
-        successes += info["is_success"]
-        failures += not info["solver"]["converged"]
-        if info["is_success"]:
+        converged = info["solver"]["converged"]
+        successes += info["is_success"] and converged
+        failures += not converged
+        if info["is_success"] and converged:
             times.append(held_since * STEP_S)
         distances.append(info["distance_mm"])
         energies.append(info["energy_J"])

@@ -60,7 +60,7 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         goals = self.task.draw_goals(self.core, self.np_random, 1)
         self.core.reset(np.zeros(1, dtype=np.intp), goals)
         observation = self._observe()
-        return observation, self._info(observation, np.array([0.0, 0.0, 0.0]))
+        return observation, self._info(observation, self.core.rest_report[0])
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, NDArray[Any]], float, bool, bool, dict[str, Any]]:
         """Heat for 0.1 s; see `gymnasium.Env.step`.
@@ -70,7 +70,10 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         ValueError
             For an action of the wrong shape or with a number that is not finite; the episode stays as it was.
         """
-        powers = np.asarray(action, dtype=np.float64)
+        try:
+            powers = np.asarray(action, dtype=np.float64)
+        except (TypeError, ValueError):
+            powers = np.empty(0)
         if powers.shape != self.action_space.shape or not np.isfinite(powers).all():
             raise ValueError(f"action = {action!r}: expected finite numbers of shape {self.action_space.shape}")
         report = self.core.step(powers[np.newaxis])[0]
@@ -87,7 +90,10 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         return float(reward) if np.ndim(reward) == 0 else reward.astype(np.float32)
 
     def get_state(self) -> dict[str, Any]:
-        """Return the episode, to the last bit, as arrays by name and the state of the random generator ("rng")."""
+        """Return the episode, to the last bit, as arrays by name and the state of the random generator ("rng").
+
+        The count of steps belongs to Gymnasium's `TimeLimit` and is not part of it.
+        """
         record = self.core.record.copy()
         state: dict[str, Any] = {f.name: getattr(record, f.name) for f in fields(record)}
         state["rng"] = self.np_random.bit_generator.state
@@ -106,7 +112,13 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         found = {name: np.shape(value) for name, value in state.items() if name != "rng"}
         if found != shapes or "rng" not in state:
             raise ValueError(f"state has arrays {found}: expected {shapes} and 'rng'")
-        self.np_random.bit_generator.state = state["rng"]
+        for name in shapes:
+            if not np.isfinite(np.asarray(state[name], dtype=np.float64)).all():
+                raise ValueError(f"state[{name!r}] = {state[name]!r}: expected finite numbers")
+        try:
+            self.np_random.bit_generator.state = state["rng"]
+        except (TypeError, ValueError, KeyError):
+            raise ValueError(f"state['rng'] = {state['rng']!r}: expected the state of a bit generator") from None
         for name in shapes:
             getattr(record, name)[...] = state[name]
 

@@ -122,11 +122,19 @@ def test_a_foreign_state_is_refused_and_changes_nothing(env):
     env.reset(seed=1)
     unwrapped = env.unwrapped
     before = unwrapped.get_state()
-    for wrong in ({}, {**before, "tip": np.zeros((2, 4, 4))}, {k: v for k, v in before.items() if k != "rng"}):
-        with pytest.raises(ValueError, match="state has arrays"):
+    cold = {**before, "temperature": np.full_like(before["temperature"], np.nan)}
+    for wrong, message in (
+        ({}, "state has arrays"),
+        ({**before, "tip": np.zeros((2, 4, 4))}, "state has arrays"),
+        ({k: v for k, v in before.items() if k != "rng"}, "state has arrays"),
+        (cold, r"state\['temperature'\] = "),
+        ({**before, "rng": "dice"}, r"state\['rng'\] = 'dice'"),
+    ):
+        with pytest.raises(ValueError, match=message):
             unwrapped.set_state(wrong)
     after = unwrapped.get_state()
     assert all(np.array_equal(before[key], after[key]) for key in before if key != "rng")
+    assert before["rng"] == after["rng"]
 
 
 def test_observations_stay_in_their_finite_space(env):
@@ -203,13 +211,13 @@ def test_the_cut_off_keeps_every_tca_below_the_hard_limit(env):
     assert temperature.max() < HARD_LIMIT
 
 
-@pytest.mark.parametrize("bad", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0], [[0, 0, 0]], 0.0])
+@pytest.mark.parametrize("bad", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0], [[0, 0, 0]], 0.0, "abc", [[0], 0, 0], object()])
 def test_bad_actions_are_refused_and_leave_the_episode_as_it_was(env, bad):
     env.reset(seed=3)
     roll(env, actions(env, 5))
     unwrapped, twin = env.unwrapped, copy.deepcopy(env.unwrapped)
     with pytest.raises(ValueError, match="action = "):
-        unwrapped.step(np.array(bad, dtype=np.float32))
+        unwrapped.step(bad)
     assert_same(roll(twin, actions(env, 5)), roll(unwrapped, actions(env, 5)))
 
 

@@ -49,6 +49,16 @@ def test_goals_come_from_their_split(split, monkeypatch):
     assert all(held_out(temperature) == (split == "held-out") for temperature in drawn)
 
 
+def test_held_out_goals_lie_apart_from_training_goals():
+    """The nearest training goal of a grid is typically half a success radius away or more: a split for interpolation."""
+    core = Reach("train").core(1)
+    grid = np.stack(np.meshgrid(*[AMBIENT + 6.25 + 12.5 * np.arange(10)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    held = np.array([held_out(temperature) for temperature in grid])
+    tips = core.settle(grid)[0].tip[:, :3, 3]
+    nearest = [np.linalg.norm(tips[~held] - tip, axis=1).min() for tip in tips[held]]
+    assert np.median(nearest) > 5e-4
+
+
 def test_goals_do_not_depend_on_the_episode_before():
     env = gym.make("TCAReach-v0", split="held-out")
     goals = [env.reset(seed=seed)[0]["desired_goal"] for seed in (1, 2, 1)]

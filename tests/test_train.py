@@ -70,6 +70,30 @@ def test_resume_goes_on(trained):
     assert steps == sorted(steps) and steps[-1] == 1600
 
 
+def test_resume_keeps_the_seed(trained):
+    folder, _ = trained
+    assert json.loads((folder / "report.json").read_text())["seed"] == 3
+    assert json.loads((folder / "policy.json").read_text())["seed"] == 3
+
+
+def test_ppo_trains_and_goes_on_without_a_replay_buffer(tmp_path):
+    folder = tmp_path / "ppo"
+    for arguments in (["--algo", "ppo", "--out", folder], ["--resume", folder]):
+        done = run(*arguments, "--steps", 2048, "--episodes", 1)
+        assert done.returncode == 0, done.stderr
+    assert json.loads((folder / "report.json").read_text())["policy_steps"] >= 2048
+
+
+def test_a_fresh_run_leaves_nothing_of_an_earlier_one(tmp_path, monkeypatch):
+    folder = tmp_path / "again"
+    folder.mkdir()
+    for name in train.ARTEFACTS:
+        (folder / name).write_text("old")
+    monkeypatch.setattr(train, "train", lambda *arguments: (0.0, True))
+    assert train.main(["--out", str(folder)]) == 130
+    assert list(folder.iterdir()) == []
+
+
 def test_ctrl_c_saves_what_there_is(tmp_path):
     folder = tmp_path / "stopped"
     command = [sys.executable, str(ROOT / "train.py"), "--steps", "1000000", "--out", str(folder)]
@@ -90,7 +114,7 @@ def test_ctrl_c_saves_what_there_is(tmp_path):
     ("arguments", "message"),
     [
         (["--task", "juggle"], "--task juggle: unknown; the tasks are reach"),
-        (["--algo", "dqn"], "--algo dqn: unknown; the algorithms are sac, ppo, td3"),
+        (["--algo", "dqn"], "--algo dqn: unknown; the algorithms are sac, ppo"),
         (["--steps", "0"], "--steps 0: expected a positive integer"),
         (["--episodes", "-3"], "--episodes -3: expected a positive integer"),
         (["--seed", "-1"], "--seed -1: expected an integer of at least 0"),

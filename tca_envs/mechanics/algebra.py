@@ -1,5 +1,8 @@
 """Vectors and 3 x 3 matrices as tuples, for compiled kernels: they live in registers and allocate nothing.
 
+Numba's cache watches the file of a kernel, not those of the kernels that it calls: after a change here or in `muscle`, delete
+the package's `__pycache__` folders.
+
 A matrix is its nine numbers, row by row. A quaternion is (w, x, y, z).
 """
 

@@ -302,7 +302,8 @@ class Arm:
         Raises
         ------
         ValueError
-            For a wrong shape, non-finite numbers, a drive outside its law's range or a start of another arm.
+            For a wrong shape, non-finite numbers, a drive outside its law's range or a start with another number of muscles or
+            another length.
 
         Notes
         -----

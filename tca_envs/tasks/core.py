@@ -1,7 +1,7 @@
 """The clock of every environment: heat -> solve -> observe, for N lanes at once.
 
 A lane is one arm in one episode. Everything that it owns is a row of the arrays of a `Record`, its warm start included, so a
-copy of the rows is a snapshot, and two lanes with equal rows have equal futures.
+copy of the rows is a snapshot, and equal rows under equal actions stay equal.
 """
 
 from dataclasses import dataclass, fields
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from tca_envs.mechanics import Arm, thermal
 from tca_envs.mechanics.collocation import FAILED, solve_lanes
-from tca_envs.mechanics.thermal import Heater
+from tca_envs.mechanics.thermal import HARD_LIMIT, Heater
 
 Array = NDArray[np.float64]
 
 STEP_S = 0.1
 """Duration of a step [s]."""
-CUT_OFF = 158.0
-"""Temperature [degC] that the heaters' firmware never lets a TCA exceed: below the hard limit of 160 degC."""
+CUT_OFF = HARD_LIMIT - 2.0
+"""Temperature [degC] that the heaters' firmware never lets a TCA exceed."""
 
 RAMPS = (5, 16)
 """Coarse and fine steps in which `Core.settle` heats."""
@@ -84,11 +84,11 @@ class Core:
         self.arm = arm
         self.heating = heater.scaled(arm.rest_lengths)
         self._load = arm.load()[np.newaxis]
-        self.rest = self._rest(goal_size)
+        self.rest, self.rest_report = self._rest(goal_size)
         self.record = self.rest.rows(np.zeros(lanes, dtype=np.intp))
 
-    def _rest(self, goal_size: int) -> Record:
-        """Return the one-lane record of the arm at ambient temperature: where every episode starts."""
+    def _rest(self, goal_size: int) -> tuple[Record, Array]:
+        """Return the one-lane record of the arm at ambient temperature, where every episode starts, and its solve (1, 3)."""
         n = len(self.arm.muscles)
         temperature = np.full((1, n), self.heating.ambient)
         strain, tension, drive, load = (values[np.newaxis] for values in self.arm.unloaded())
@@ -108,7 +108,7 @@ class Core:
         report = self._solve(record, temperature.copy())
         if report[0, 0] == FAILED:
             raise RuntimeError(f"the arm has no equilibrium at {self.heating.ambient:g} degC to start from")
-        return record
+        return record, report
 
     def _solve(self, record: Record, temperature: Array) -> Array:
         """Bring lanes to equilibrium at `temperature`; where there is none, keep them as they are. Returns (N, 3)."""
