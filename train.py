@@ -276,6 +276,7 @@ def save_curve(curve: list[dict[str, float]], folder: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator
 
     figure, (top, bottom) = plt.subplots(2, 1, sharex=True, figsize=(6.0, 5.0), layout="constrained")
     steps = [row["steps"] / 1000.0 for row in curve]
@@ -283,6 +284,7 @@ def save_curve(curve: list[dict[str, float]], folder: Path) -> None:
     top.set(ylabel="success rate [%]", ylim=(-3, 103), title=f"{folder.name}: {CURVE_EPISODES} episodes per point")
     bottom.semilogy(steps, [row["final_distance_mm"] for row in curve], "o-", ms=3, color="tab:orange")
     bottom.set(xlabel="environment steps [thousands]", ylabel="mean final distance [mm]")
+    bottom.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
     for axis_format in (bottom.yaxis.set_major_formatter, bottom.yaxis.set_minor_formatter):
         axis_format("{x:g}")
     for axes in (top, bottom):
