@@ -98,13 +98,24 @@ def test_a_fresh_run_leaves_nothing_of_an_earlier_one(tmp_path, monkeypatch):
 def test_ctrl_c_saves_what_there_is(tmp_path):
     folder = tmp_path / "stopped"
     command = [sys.executable, str(ROOT / "train.py"), "--steps", "1000000", "--out", str(folder)]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    # Background shells ignore SIGINT and hand that on; a person's terminal does not.
+    with subprocess.Popen(
+        command,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as process:
         while not (folder / "policy.json").exists():
             assert process.poll() is None, process.stderr.read()
             time.sleep(0.1)
         time.sleep(3.0)
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=120)
+        try:
+            out, err = process.communicate(timeout=120)
+        finally:
+            process.kill()
     assert process.returncode == 130, err
     assert f"python train.py --resume {folder}" in out
     for name in ("policy.zip", "last.zip", "curve.csv"):
