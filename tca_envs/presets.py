@@ -6,7 +6,7 @@ that add up to the arm's measured 6 g.
 
 from math import pi
 
-from tca_envs.mechanics import TCA, Arm, Grid, Module, Muscle, Payload
+from tca_envs.mechanics import TCA, Arm, Grid, Gripper, Module, Muscle, Payload
 
 YOUNGS_MODULUS = 0.125e6
 """Ecoflex 30 [Pa] (paper, section IV)."""
@@ -27,10 +27,30 @@ BENDING_ANGLES = (0.0, 2.0 * pi / 3.0, 4.0 * pi / 3.0)
 BENDING_MASS = 3.9e-3
 """[kg] (estimate)."""
 
+TWISTING_LENGTH = 16e-3
+"""[m] (paper, section IV.B)."""
+TWISTING_OFFSET = 3.5e-3
+"""Distance of the helical TCA from the centerline [m] (paper, section IV.B)."""
+TWISTING_TURNS = 5.0
+"""(paper, section IV.B)."""
 TWISTING_MASS = 1.2e-3
 """[kg] (estimate)."""
+
+GRIPPER_LENGTH = 35e-3
+"""Of the ring's centerline [m]: u* = 2 pi/L = 179.5 1/m."""
+GRIPPER_THICKNESS, GRIPPER_WIDTH = 3e-3, 6e-3
+"""Section of the ring, radial and axial [m] (paper, section IV)."""
+GRIPPER_STIFFNESS = 2.1e-5
+"""EI [N m2], measured: layers of tape stiffen the ring, 1.7e-6 would follow from the elastomer alone."""
+GRIPPER_OFFSET = 2.5e-3
+"""Distance of the TCA from the ring's centerline, outside [m] (paper, section IV.B)."""
 GRIPPER_MASS = 0.9e-3
 """[kg] (estimate)."""
+GRIPPER_CENTRE = (0.0, 0.0, GRIPPER_LENGTH / (2.0 * pi))
+"""Centre of the gripper's mass in the frame of the twisting module's end [m]: the ring hangs from it."""
+JAW_DEPTH = GRIPPER_LENGTH / pi
+"""Distance of the jaws from the twisting module's end [m]: the ring's diameter, 0.5 to 1.3 mm less than when it is open."""
+
 BELOW_BENDING = Payload(TWISTING_MASS + GRIPPER_MASS, (0.0, 0.0, 12e-3))
 """Twisting module and gripper as a rigid body: centre of mass 12 mm below the bending module's tip (estimate)."""
 
@@ -40,6 +60,31 @@ def bending_module(tca: TCA | None = None) -> Module:
     law = tca or TCA()
     muscles = [Muscle(BENDING_OFFSET, angle, 0.0, law) for angle in BENDING_ANGLES]
     return Module.cylinder(BENDING_LENGTH, BODY_DIAMETER, YOUNGS_MODULUS, SHEAR_MODULUS, BENDING_MASS, muscles)
+
+
+def twisting_module(tca: TCA | None = None) -> Module:
+    """Return the paper's twisting module: one TCA wound around a soft cylinder."""
+    muscle = Muscle(TWISTING_OFFSET, 0.0, TWISTING_TURNS, tca or TCA())
+    return Module.cylinder(TWISTING_LENGTH, BODY_DIAMETER, YOUNGS_MODULUS, SHEAR_MODULUS, TWISTING_MASS, [muscle])
+
+
+def gripper(tca: TCA | None = None) -> Gripper:
+    """Return the paper's gripper; the tape is taken to stiffen the ring in tension as much as in bending (estimate)."""
+    area = GRIPPER_THICKNESS * GRIPPER_WIDTH
+    elastomer = YOUNGS_MODULUS * area * GRIPPER_THICKNESS**2 / 12.0
+    axial = YOUNGS_MODULUS * area * GRIPPER_STIFFNESS / elastomer
+    return Gripper(GRIPPER_LENGTH, GRIPPER_STIFFNESS, axial, GRIPPER_OFFSET, tca or TCA())
+
+
+def whole_arm(tca: TCA | None = None) -> Arm:
+    """Return bending and twisting module in series with the gripper's weight at the end.
+
+    The strain of a helical muscle's module turns with the muscle, so that module has six elements, less than a turn each.
+    The tip lies within 10 um of that of a grid ten times finer at all temperatures up to the heaters' cut-off
+    (tests/test_benchmark.py); a smaller tolerance would not bring it nearer.
+    """
+    modules = [bending_module(tca), twisting_module(tca)]
+    return Arm(modules, GRAVITY, Payload(GRIPPER_MASS, GRIPPER_CENTRE), [Grid(1, 7), Grid(6, 4)], tolerance=1e-5)
 
 
 def bending_arm(tca: TCA | None = None) -> Arm:

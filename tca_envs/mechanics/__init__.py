@@ -2,6 +2,7 @@
 
 from tca_envs.mechanics.arm import Arm, Grid, Module, Payload
 from tca_envs.mechanics.equilibrium import Equilibrium
+from tca_envs.mechanics.gripper import Gripper
 from tca_envs.mechanics.muscle import TCA, Muscle, Spring, Tendon
 
-__all__ = ["TCA", "Arm", "Equilibrium", "Grid", "Module", "Muscle", "Payload", "Spring", "Tendon"]
+__all__ = ["TCA", "Arm", "Equilibrium", "Grid", "Gripper", "Module", "Muscle", "Payload", "Spring", "Tendon"]

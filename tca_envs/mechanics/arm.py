@@ -15,6 +15,7 @@ from tca_envs.mechanics.collocation import (
     FALL,
     LOAD,
     SUBSTEPS,
+    WARM,
     Model,
     shape,
     solve_lanes,
@@ -27,7 +28,6 @@ Array = NDArray[np.float64]
 ArrayOf3 = tuple[float, float, float]
 ZERO: ArrayOf3 = (0.0, 0.0, 0.0)
 EYE = np.eye(4)[np.newaxis]
-HOW = {SUBSTEPS: " in substeps of drive and load", FALL: " after a fall from the end of the start's branch"}
 STRAIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -248,8 +248,15 @@ class Arm:
         self.length = sum(module.length for module in self.modules)
         self.muscles = tuple(muscle for module in self.modules for muscle in module.muscles)
         self.model, self.node_arc = _compile(self.modules, self.grids, self.tolerance)
-        ranges = np.array([muscle.law.drive_range() for muscle in self.muscles]).reshape(-1, 2)
-        self._lowest, self._highest = ranges.T.copy()
+        ranges = [muscle.law.drive_range() for muscle in self.muscles]
+        self._lowest, self._highest = [low for low, _ in ranges], [high for _, high in ranges]
+        found = f"converged below {self.tolerance:g}"
+        self._messages = {
+            WARM: found,
+            SUBSTEPS: f"{found} in substeps of drive and load",
+            FALL: f"{found} after a fall from the end of the start's branch",
+            FAILED: "no equilibrium found by Newton, substeps or a damped fall; this is the start's shape",
+        }
         self._neutral = np.array(
             [m.law.neutral_drive(rest) for m, rest in zip(self.muscles, self.model.rest_length, strict=True)]
         )
@@ -317,18 +324,17 @@ class Arm:
         else:
             strain, tension, from_drive, from_load = self._restart(start)
         tip, lengths, report = EYE.copy(), np.empty((1, drive.size)), np.empty((1, 3))
-        lanes = [values[np.newaxis] for values in (strain, tension, from_drive, from_load, drive, load)]
-        solve_lanes(self.model, *lanes, tip, lengths, report)
+        solve_lanes(
+            self.model, strain[np.newaxis], tension[np.newaxis], from_drive[np.newaxis], from_load[np.newaxis],
+            drive[np.newaxis], load[np.newaxis], tip, lengths, report,
+        )  # fmt: skip
         rung, residual, iterations = report[0].tolist()
         converged = rung != FAILED
-        if converged:
-            message = f"converged below {self.tolerance:g}" + HOW.get(rung, "")
-        else:
-            message = "no equilibrium found by Newton, substeps or a damped fall; this is the start's shape"
+        if not converged:
             ends, _, position, _, _, lengths[0] = shape(self.model, strain, tension, from_drive, from_load)
             tip[0] = pose(ends[-1], position[-1])
         # Where there is no answer, from_drive and from_load still are the start's.
-        state = (strain, tension, from_drive, from_load)
+        state = _Shape(self, strain, tension, from_drive, from_load)
         return Equilibrium(
             tip_pose=tip[0],
             tensions=tension,
@@ -337,23 +343,22 @@ class Arm:
             converged=converged,
             residual=residual,
             iterations=int(iterations),
-            message=message,
+            message=self._messages[int(rung)],
             length=self.length,
             load=load,
-            sample=_Sampler(self, *state),
-            differentiate=_Differentiator(self, *state),
+            sample=state.sample,
+            differentiate=state.differentiate,
             nodes=(self.model, strain),
         )
 
     def checked_drive(self, drive: ArrayLike) -> Array:
         """Return `drive` as (n,) floats; ValueError for a wrong shape, non-finite numbers or values out of a law's range."""
         result = check.array("drive", drive, (len(self.muscles),))
-        if not (np.minimum(np.maximum(result, self._lowest), self._highest) == result).all():
-            i = int(np.argmax((result < self._lowest) | (result > self._highest)))
-            raise ValueError(
-                f"drive[{i}] = {result[i]:g}: expected a value in [{self._lowest[i]:g}, {self._highest[i]:g}] for "
-                f"{type(self.muscles[i].law).__name__}"
-            )
+        for i, (low, value, high) in enumerate(zip(self._lowest, result.tolist(), self._highest, strict=True)):
+            if not low <= value <= high:
+                raise ValueError(
+                    f"drive[{i}] = {value:g}: expected a value in [{low:g}, {high:g}] for {type(self.muscles[i].law).__name__}"
+                )
         return result
 
     def _restart(self, start: Equilibrium) -> tuple[Array, Array, Array, Array]:
@@ -365,8 +370,8 @@ class Arm:
                 f"arm, with {len(self.muscles)} and {self.length:g} m"
             )
         # A failed solve holds the shape of its own start, so that is where the substeps begin.
-        from_drive = getattr(start.sample, "drive", start.drive)
-        from_load = getattr(start.sample, "load", start.load)
+        held = getattr(start.sample, "__self__", start.sample)
+        from_drive, from_load = getattr(held, "drive", start.drive), getattr(held, "load", start.load)
         if start.nodes is not None and start.nodes[0] is self.model:
             strain = start.nodes[1].copy()
         else:
@@ -374,9 +379,8 @@ class Arm:
         return strain, start.tensions.copy(), from_drive.copy(), from_load.copy()
 
 
-@dataclass(frozen=True, eq=False)
-class _Sampler:
-    """Shape between the nodes: collocation polynomials for pose and moment, section balance for the strain."""
+class _Shape(NamedTuple):
+    """A known equilibrium, and what follows from it where it is asked for."""
 
     arm: Arm
     strain: Array
@@ -384,7 +388,12 @@ class _Sampler:
     drive: Array
     load: Array
 
-    def __call__(self, s: Array) -> tuple[Array, Array]:
+    def differentiate(self) -> Array:
+        """Return d tip/d drive (6, n)."""
+        return tip_jacobian(self.arm.model, self.strain, self.tension.copy(), self.drive, self.load)
+
+    def sample(self, s: Array) -> tuple[Array, Array]:
+        """Return poses and strains at `s`: collocation polynomials for pose and moment, section balance for the strain."""
         arm, model = self.arm, self.arm.model
         ends, quaternion, position, tangent, spin, _ = shape(model, self.strain, self.tension.copy(), self.drive, self.load)
         rotation = pose(ends[-1], position[-1])[:3, :3]
@@ -431,18 +440,6 @@ class _Sampler:
                 mass += module.mass_per_length * h
             start = base
         return poses, strains
-
-
-@dataclass(frozen=True, eq=False)
-class _Differentiator:
-    arm: Arm
-    strain: Array
-    tension: Array
-    drive: Array
-    load: Array
-
-    def __call__(self) -> Array:
-        return tip_jacobian(self.arm.model, self.strain, self.tension.copy(), self.drive, self.load)
 
 
 def pose(quaternion: Array, position: Array) -> Array:
