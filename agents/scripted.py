@@ -4,6 +4,7 @@ They have the interface of a Stable-Baselines3 policy, `predict(observation) -> 
 runs a trained policy runs them too.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,22 +14,36 @@ from tca_envs import presets
 from tca_envs.mechanics import Arm, Equilibrium, thermal
 from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT, Heater
 from tca_envs.tasks.core import STEP_S
+from tca_envs.tasks.task import yaw
+from tca_envs.tasks.twist_align import SUCCESS_CM, SUCCESS_DEG
 
 Array = NDArray[np.float64]
 
+Aim = Callable[[Equilibrium], tuple[Array, Array]]
+"""Equilibrium -> what is missing to the goal (k,) [m] and the derivative of what is there in the temperatures (k, n) [m/K]."""
+
 CLOSE_ENOUGH = 5e-5
 """Distance of the planned tip from the goal [m] at which planning ends: a twentieth of what the task asks."""
+METRES_PER_RADIAN = SUCCESS_CM / 100.0 / np.radians(SUCCESS_DEG)
+"""Weight of yaw errors in plans: a tolerance of yaw counts like one of position."""
+MOST_YAW = np.radians(60.0)
+"""Yaws are counted from here down a full turn: heating the helix turns one way, by at most 250 degrees or so."""
 
 
-class ReachController:
+class SteadyController:
     """Plan the temperatures that put the tip on the goal, then drive each TCA there.
 
     The plan is Gauss-Newton on the arm's model with `tip_jacobian`, anew for every new goal. The drive is feed-forward
     and feedback in one: the power that takes the measured temperature to the next one in a step, all TCAs keeping pace.
+
+    Parameters
+    ----------
+    arm : Arm
+        The arm that the task steps.
     """
 
-    def __init__(self) -> None:
-        self.arm = presets.bending_arm()
+    def __init__(self, arm: Arm) -> None:
+        self.arm = arm
         self.heating = Heater().scaled(self.arm.rest_lengths)
         self.goal: Array | None = None
         self.target = np.full(len(self.arm.muscles), AMBIENT)
@@ -40,38 +55,115 @@ class ReachController:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """Return the action (3,) for an observation of TCAReach; the other arguments are SB3's and not read."""
+        """Return the action (n,) for an observation of the task; the other arguments are SB3's and not read."""
         goal = np.asarray(observation["desired_goal"], dtype=np.float64)
         if self.goal is None or not np.array_equal(goal, self.goal):
-            self.goal, self.target = goal, plan(self.arm, goal / 100.0)
-        temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * np.asarray(observation["observation"][:3], dtype=np.float64)
-        waypoint = self._waypoint(temperature)
-        power = thermal.power_to_reach(temperature, waypoint, STEP_S, self.heating)
-        action = 2.0 * np.clip(power / self.heating.max_power, 0.0, 1.0) - 1.0
-        return action.astype(np.float32), None
+            self.goal, self.target = goal, self.plan(goal)
+        count = len(self.target)
+        temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * np.asarray(observation["observation"][:count], dtype=np.float64)
+        return drive(temperature, self.target, self.heating).astype(np.float32), None
 
-    def _waypoint(self, temperature: Array) -> Array:
-        """Return the temperatures to aim at next, on the straight way from ambient to the target.
-
-        The TCA that needs longest sets the pace, so nothing is lost, and the arm comes to the equilibrium that slow heating
-        leads to: with one TCA near 150 degC it has others, buckled to the other side.
-        """
-        rise = self.target - AMBIENT
-        reachable = thermal.step(temperature, self.heating.max_power, STEP_S, self.heating) - AMBIENT
-        share = min([1.0, *(reachable[rise > 0.0] / rise[rise > 0.0])])
-        return AMBIENT + share * rise
+    def plan(self, goal: Array) -> Array:
+        """Return the temperatures (n,) [degC] whose steady state is the goal, in the units of the task."""
+        raise NotImplementedError
 
 
-def plan(arm: Arm, goal: Array) -> Array:
-    """Return temperatures (n,) [degC] between ambient and the soft limit whose steady tip is nearest to `goal` (3,) [m].
+class ReachController(SteadyController):
+    """Solves TCAReach."""
 
-    Gauss-Newton, first from all TCAs lukewarm, then from each one hot: in a straight arm the Jacobian hides what heating
+    def __init__(self) -> None:
+        super().__init__(presets.bending_arm())
+
+    def plan(self, goal: Array) -> Array:
+        """Return temperatures (3,) [degC] that bring the tip to `goal` (3,) [cm]."""
+        return plan(self.arm, tip_at(goal / 100.0), BENDING_STARTS)
+
+
+class TwistAlignController(SteadyController):
+    """Solves TCATwistAlign."""
+
+    def __init__(self) -> None:
+        super().__init__(presets.whole_arm())
+
+    def plan(self, goal: Array) -> Array:
+        """Return temperatures (4,) [degC] that bring the tip to `goal` (5,): x, y, z [cm], cosine and sine of the yaw."""
+        turn = unwrapped(float(np.arctan2(goal[4], goal[3])))
+        starts = np.column_stack([BENDING_STARTS, np.full(len(BENDING_STARTS), helix_temperature(self.arm, turn))])
+        return plan(self.arm, tip_and_yaw_at(goal[:3] / 100.0, turn), starts)
+
+
+def drive(temperature: Array, target: Array, heating: thermal.Heating) -> Array:
+    """Return the action (n,) that takes TCAs from `temperature` towards `target` (n,) [degC], on the straight way from ambient.
+
+    The TCA that needs longest sets the pace, so nothing is lost, and the arm comes to the equilibrium that slow heating
+    leads to: with one TCA near 150 degC it has others, buckled to the other side.
+    """
+    rise = target - AMBIENT
+    reachable = thermal.step(temperature, heating.max_power, STEP_S, heating) - AMBIENT
+    share = min([1.0, *(reachable[rise > 0.0] / rise[rise > 0.0])])
+    power = thermal.power_to_reach(temperature, AMBIENT + share * rise, STEP_S, heating)
+    return 2.0 * np.clip(power / heating.max_power, 0.0, 1.0) - 1.0
+
+
+BENDING_STARTS = np.vstack([np.full(3, 60.0), 60.0 + 60.0 * np.eye(3), 120.0 - 60.0 * np.eye(3)])
+"""Where plans begin [degC]: all bending TCAs lukewarm, then each one hot, then each one cooler than the others."""
+
+
+def tip_at(goal: Array) -> Aim:
+    """Return the aim of a tip position (3,) [m]."""
+    return lambda here: (goal - here.tip_pose[:3, 3], here.tip_jacobian[:3])
+
+
+def tip_and_yaw_at(goal: Array, turn: float) -> Aim:
+    """Return the aim of a tip position (3,) [m] and a yaw [rad] as of `unwrapped`."""
+
+    def aim(here: Equilibrium) -> tuple[Array, Array]:
+        jacobian = here.tip_jacobian
+        missing = np.append(goal - here.tip_pose[:3, 3], METRES_PER_RADIAN * (turn - yaw_of(here)))
+        return missing, np.vstack([jacobian[:3], METRES_PER_RADIAN * yaw_gradient(here.tip_pose) @ jacobian[3:]])
+
+    return aim
+
+
+def unwrapped(angle: float) -> float:
+    """Return an angle [rad] as a yaw in (MOST_YAW - 2 pi, MOST_YAW]."""
+    return MOST_YAW - (MOST_YAW - angle) % (2.0 * np.pi)
+
+
+def yaw_of(here: Equilibrium) -> float:
+    """Return the yaw of the tip [rad], unwrapped."""
+    cosine, sine = yaw(here.tip_pose[np.newaxis])
+    return unwrapped(float(np.arctan2(sine[0], cosine[0])))
+
+
+def yaw_gradient(pose: Array) -> Array:
+    """Return d yaw/d(rotation vector added in the base frame) (3,) of a pose (4, 4)."""
+    r = pose[:3, :3]
+    cosine, sine = r[0, 0] + r[1, 1], r[1, 0] - r[0, 1]
+    # d r_ij = (w x r_j)_i
+    d_cosine = np.array([-r[2, 1], r[2, 0], r[0, 1] - r[1, 0]])
+    d_sine = np.array([-r[2, 0], -r[2, 1], r[0, 0] + r[1, 1]])
+    return (cosine * d_sine - sine * d_cosine) / (cosine**2 + sine**2)
+
+
+def helix_temperature(arm: Arm, turn: float) -> float:
+    """Return the temperature [degC] of the helical TCA at which the straight hanging arm has turned by about `turn` [rad]."""
+    here, temperatures, turns = None, np.linspace(AMBIENT, SOFT_LIMIT, 12), []
+    for temperature in temperatures:
+        here = arm.equilibrium([AMBIENT, AMBIENT, AMBIENT, temperature], start=here)
+        turns.append(yaw_of(here))
+    return float(np.interp(-turn, -np.array(turns), temperatures))
+
+
+def plan(arm: Arm, aim: Aim, starts: Array) -> Array:
+    """Return temperatures (n,) [degC] between ambient and the soft limit whose steady state misses `aim` least.
+
+    Gauss-Newton from each of `starts` (s, n) until one comes close: in a straight arm the Jacobian hides what heating
     does sideways, and a start near the answer's branch finds that branch.
     """
     best, best_distance = np.full(len(arm.muscles), AMBIENT), np.inf
-    starts = np.vstack([np.full(3, 60.0), 60.0 + 60.0 * np.eye(3), 120.0 - 60.0 * np.eye(3)])
     for start in starts:
-        temperature, distance = _gauss_newton(arm, goal, start)
+        temperature, distance = _gauss_newton(arm, aim, start)
         if distance < best_distance:
             best, best_distance = temperature, distance
         if best_distance < CLOSE_ENOUGH:
@@ -79,15 +171,14 @@ def plan(arm: Arm, goal: Array) -> Array:
     return best
 
 
-def _gauss_newton(arm: Arm, goal: Array, start: Array) -> tuple[Array, float]:
-    """Return the best temperatures found from `start` and their tip's distance to the goal [m]."""
+def _gauss_newton(arm: Arm, aim: Aim, start: Array) -> tuple[Array, float]:
+    """Return the best temperatures found from `start` and by how much they miss the aim [m]."""
     temperature, damping = start, 1e-3
     here = _steady(arm, temperature)
-    error = goal - here.tip_pose[:3, 3]
+    error, jacobian = aim(here)
     for _ in range(30):
         if np.linalg.norm(error) < 0.1 * CLOSE_ENOUGH:
             break
-        jacobian = here.tip_jacobian[:3]
         normal = jacobian.T @ jacobian
         # TCAs at a limit that the step would push beyond it take no part in it.
         gradient = jacobian.T @ error
@@ -99,15 +190,15 @@ def _gauss_newton(arm: Arm, goal: Array, start: Array) -> tuple[Array, float]:
         step[free] = np.clip(np.linalg.solve(scaled, gradient[free]), -40.0, 40.0)
         trial = np.clip(temperature + step, AMBIENT, SOFT_LIMIT)
         there = arm.equilibrium(trial, start=here)
-        new_error = goal - there.tip_pose[:3, 3]
+        new_error, new_jacobian = aim(there)
         if there.converged and np.linalg.norm(new_error) < np.linalg.norm(error):
-            temperature, here, error, damping = trial, there, new_error, max(0.2 * damping, 1e-9)
+            temperature, here, error, jacobian, damping = trial, there, new_error, new_jacobian, max(0.2 * damping, 1e-9)
         elif damping > 1e3:
             break
         else:
             damping *= 5.0
     # Newton's way may have led to an equilibrium that heating does not lead to.
-    return temperature, float(np.linalg.norm(goal - _steady(arm, temperature).tip_pose[:3, 3]))
+    return temperature, float(np.linalg.norm(aim(_steady(arm, temperature))[0]))
 
 
 def _steady(arm: Arm, temperature: Array) -> Equilibrium:
@@ -140,5 +231,5 @@ class RandomPolicy:
         return self.rng.uniform(-1.0, 1.0, self.size).astype(np.float32), None
 
 
-CONTROLLERS = {"reach": ReachController}
+CONTROLLERS = {"reach": ReachController, "twist-align": TwistAlignController}
 """Scripted controller of each task."""

@@ -42,8 +42,7 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         self.reward = reward
         self.task = TASKS[task](split)
         self.core = self.task.core(1)
-        size = len(self.core.arm.muscles)
-        self.action_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (self.task.actions,), np.float32)
         self.observation_space = spaces.Dict(
             {
                 "observation": self.task.observation_space,
@@ -57,13 +56,13 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
     ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Start an episode from rest with a new goal; see `gymnasium.Env.reset`. No option is known."""
         super().reset(seed=seed)
-        goals = self.task.draw_goals(self.core, self.np_random, 1)
-        self.core.reset(np.zeros(1, dtype=np.intp), goals)
+        goals, scenes = self.task.draw(self.core, self.np_random, 1)
+        self.core.reset(np.zeros(1, dtype=np.intp), goals, scenes)
         observation = self._observe()
         return observation, self._info(observation, self.core.rest_report[0])
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, NDArray[Any]], float, bool, bool, dict[str, Any]]:
-        """Heat for 0.1 s; see `gymnasium.Env.step`.
+        """Act for 0.1 s; see `gymnasium.Env.step`.
 
         Raises
         ------
@@ -71,12 +70,12 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
             For an action of the wrong shape or with a number that is not finite; the episode stays as it was.
         """
         try:
-            powers = np.asarray(action, dtype=np.float64)
+            command = np.asarray(action, dtype=np.float64)
         except (TypeError, ValueError):
-            powers = np.empty(0)
-        if powers.shape != self.action_space.shape or not np.isfinite(powers).all():
+            command = np.empty(0)
+        if command.shape != self.action_space.shape or not np.isfinite(command).all():
             raise ValueError(f"action = {action!r}: expected finite numbers of shape {self.action_space.shape}")
-        report = self.core.step(powers[np.newaxis])[0]
+        report = self.task.step(self.core, command[np.newaxis])[0]
         observation = self._observe()
         reward = self.compute_reward(observation["achieved_goal"], observation["desired_goal"], None)
         return observation, reward, False, bool(report[0] == FAILED), self._info(observation, report)

@@ -56,7 +56,7 @@ Array = NDArray[np.float64]
 # A load is (13,): tip force [N] and tip moment [N m] in the global frame, gravity [m/s2],
 # payload mass [kg] and its centre in the tip's frame [m].
 LOAD = 13
-FORCE, MOMENT, GRAVITY, PAYLOAD_MASS, PAYLOAD_CENTRE = 0, 3, 6, 9, 10
+PAYLOAD_MASS = 9
 
 MAX_ITERATIONS = 12
 MAX_FALL = 400

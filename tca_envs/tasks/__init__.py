@@ -1,5 +1,6 @@
 """Tasks: goal, observation and success of each environment, and the clock that they share."""
 
 from tca_envs.tasks.reach import Reach
+from tca_envs.tasks.twist_align import TwistAlign
 
-TASKS = {"reach": Reach}
+TASKS = {"reach": Reach, "twist-align": TwistAlign}

@@ -4,13 +4,14 @@ A lane is one arm in one episode. Everything that it owns is a row of the arrays
 copy of the rows is a snapshot, and equal rows under equal actions stay equal.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tca_envs.mechanics import Arm, thermal
-from tca_envs.mechanics.collocation import FAILED, solve_lanes
+from tca_envs.mechanics.collocation import FAILED, PAYLOAD_MASS, solve_lanes
 from tca_envs.mechanics.thermal import HARD_LIMIT, Heater
 
 Array = NDArray[np.float64]
@@ -28,12 +29,12 @@ SAME_TIP = 1e-5
 
 @dataclass
 class Record:
-    """N lanes of an arm with n muscles."""
+    """N lanes of an arm with n muscles, and of m >= n heated TCAs: the arm's come first."""
 
     temperature: Array
-    """(N, n) [degC]."""
+    """(N, m) [degC]."""
     power: Array
-    """(N, n) heating power of the last step after the cut-off [W]."""
+    """(N, m) heating power of the last step after the cut-off [W]."""
     energy: Array
     """(N,) electrical energy since the episode's start [J]."""
     strain: Array
@@ -44,12 +45,16 @@ class Record:
     """(N, n) temperatures at which strain and tension are in equilibrium [degC]."""
     load: Array
     """(N, LOAD) load at which they are."""
+    payload: Array
+    """(N, 4) what hangs from the tip: mass [kg] and its centre in the tip's frame [m]."""
     tip: Array
     """(N, 4, 4) pose of the tip [m]."""
     length: Array
     """(N, n) path lengths of the muscles [m]."""
     goal: Array
     """(N, k) the task's goal."""
+    scene: Array
+    """(N, s) what else the task keeps, such as an object's place."""
 
     def copy(self) -> "Record":
         """Return a copy that shares nothing with this record."""
@@ -76,36 +81,39 @@ class Core:
         Thermal constants of a 45 mm TCA.
     lanes : int
         N.
-    goal_size : int
-        Numbers in the task's goal.
+    goal_size, scene_size : int
+        Numbers in the task's goal and scene.
+    others : sequence of float
+        Rest lengths of heated TCAs that are not the arm's [m].
     """
 
-    def __init__(self, arm: Arm, heater: Heater, lanes: int, goal_size: int) -> None:
+    def __init__(
+        self, arm: Arm, heater: Heater, lanes: int, goal_size: int, scene_size: int = 0, others: Sequence[float] = ()
+    ) -> None:
         self.arm = arm
-        self.heating = heater.scaled(arm.rest_lengths)
-        self._load = arm.load()[np.newaxis]
-        self.rest, self.rest_report = self._rest(goal_size)
+        self.heating = heater.scaled(np.append(arm.rest_lengths, others))
+        self.rest, self.rest_report = self._rest(goal_size, scene_size)
         self.record = self.rest.rows(np.zeros(lanes, dtype=np.intp))
 
-    def _rest(self, goal_size: int) -> tuple[Record, Array]:
+    def _rest(self, goal_size: int, scene_size: int) -> tuple[Record, Array]:
         """Return the one-lane record of the arm at ambient temperature, where every episode starts, and its solve (1, 3)."""
-        n = len(self.arm.muscles)
-        temperature = np.full((1, n), self.heating.ambient)
+        ambient = np.full((1, self.heating.loss.size), self.heating.ambient)
         strain, tension, drive, load = (values[np.newaxis] for values in self.arm.unloaded())
-        tip, length = np.eye(4)[np.newaxis].copy(), np.zeros((1, n))
         record = Record(
-            temperature,
-            np.zeros((1, n)),
-            np.zeros(1),
-            strain,
-            tension,
-            drive,
-            load,
-            tip,
-            length,
-            np.zeros((1, goal_size)),
+            temperature=ambient,
+            power=np.zeros_like(ambient),
+            energy=np.zeros(1),
+            strain=strain,
+            tension=tension,
+            drive=drive,
+            load=load,
+            payload=self.arm.load()[np.newaxis, PAYLOAD_MASS:],
+            tip=np.eye(4)[np.newaxis].copy(),
+            length=np.zeros_like(tension),
+            goal=np.zeros((1, goal_size)),
+            scene=np.zeros((1, scene_size)),
         )
-        report = self._solve(record, temperature.copy())
+        report = self._solve(record, ambient.copy())
         if report[0, 0] == FAILED:
             raise RuntimeError(f"the arm has no equilibrium at {self.heating.ambient:g} degC to start from")
         return record, report
@@ -113,26 +121,29 @@ class Core:
     def _solve(self, record: Record, temperature: Array) -> Array:
         """Bring lanes to equilibrium at `temperature`; where there is none, keep them as they are. Returns (N, 3)."""
         report = np.empty((len(temperature), 3))
-        load = np.repeat(self._load, len(temperature), axis=0)
+        load = np.repeat(self.arm.load()[np.newaxis], len(temperature), axis=0)
+        load[:, PAYLOAD_MASS:] = record.payload
+        drive = np.ascontiguousarray(temperature[:, : record.drive.shape[1]])
         solve_lanes(
-            self.arm.model, record.strain, record.tension, record.drive, record.load, temperature, load,
+            self.arm.model, record.strain, record.tension, record.drive, record.load, drive, load,
             record.tip, record.length, report,
         )  # fmt: skip
         good = report[:, 0] != FAILED
         record.temperature[good] = temperature[good]
         return report
 
-    def reset(self, lanes: NDArray[np.intp], goals: Array) -> None:
-        """Put lanes at rest with new goals (len(lanes), k); nothing of their past remains."""
+    def reset(self, lanes: NDArray[np.intp], goals: Array, scenes: Array) -> None:
+        """Put lanes at rest with new goals (len(lanes), k) and scenes (len(lanes), s); nothing of their past remains."""
         self.record.assign(lanes, self.rest)
         self.record.goal[lanes] = goals
+        self.record.scene[lanes] = scenes
 
     def step(self, action: Array) -> Array:
         """Heat for one step and find the equilibrium.
 
         Parameters
         ----------
-        action : (N, n) array
+        action : (N, m) array
             Heating power in [-1, 1]: none to full.
 
         Returns
@@ -150,7 +161,7 @@ class Core:
         record.energy[good] += power[good].sum(axis=1) * STEP_S
         return report
 
-    def settle(self, temperature: Array) -> tuple[Record, NDArray[np.bool_]]:
+    def settle(self, temperature: Array, payload: Array | None = None) -> tuple[Record, NDArray[np.bool_]]:
         """Heat arms from rest to steady temperatures, as constant powers do.
 
         The way there is part of the answer: near 150 degC an arm with one hot TCA has several equilibria, because it can
@@ -159,7 +170,9 @@ class Core:
         Parameters
         ----------
         temperature : (N, n) array
-            Steady temperatures [degC].
+            Steady temperatures of the arm's TCAs [degC]; others stay at ambient.
+        payload : (4,) array, optional
+            Another payload than the arm's, see `Record.payload`.
 
         Returns
         -------
@@ -167,11 +180,15 @@ class Core:
             The settled lanes and whether each one's end is beyond doubt, (N,).
         """
         good = np.ones(len(temperature), dtype=bool)
+        target = np.full((len(temperature), self.heating.loss.size), self.heating.ambient)
+        target[:, : temperature.shape[1]] = temperature
         tips = []
         for steps in RAMPS:
             record = self.rest.rows(np.zeros(len(temperature), dtype=np.intp))
+            if payload is not None:
+                record.payload[:] = payload
             for done in np.arange(1, steps + 1) / steps:
-                report = self._solve(record, self.heating.ambient + done * (temperature - self.heating.ambient))
+                report = self._solve(record, self.heating.ambient + done * (target - self.heating.ambient))
                 good &= report[:, 0] != FAILED
             tips.append(record.tip[:, :3, 3])
         good &= np.linalg.norm(tips[0] - tips[1], axis=1) < SAME_TIP

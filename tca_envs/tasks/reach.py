@@ -9,18 +9,16 @@ from numpy.typing import NDArray
 
 from tca_envs import presets
 from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT, Heater
-from tca_envs.tasks.core import CUT_OFF, Core, Record
-
-Array = NDArray[np.float64]
+from tca_envs.tasks.core import Core, Record
+from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat
 
 SUCCESS_CM = 0.1
 """A tip within 1 mm of the goal has reached it."""
-CELL_K = 25.0
-"""Edge of the cells of temperature space that are dealt out to training and held-out goals [K]: about a millimetre of tip."""
-SPLITS = ("train", "held-out")
+BOX_CM = 7.0
+"""No coordinate of the tip can be larger: the arm is shorter."""
 
 
-class Reach:
+class Reach(Task):
     """Bring the tip of a soft arm, bent by three heated coils, to a goal position and hold it there.
 
     ## Description
@@ -86,36 +84,26 @@ class Reach:
     * v0: first version.
     """
 
-    goal_size = 3
-
-    def __init__(self, split: str) -> None:
-        if split not in SPLITS:
-            raise ValueError(f"split = {split!r}: expected one of {', '.join(map(repr, SPLITS))}")
-        self.split = split
-        box = 7.0  # cm: longer than the arm can be
-        self.goal_space = spaces.Box(-box, box, (3,), np.float32)
-        hottest = (CUT_OFF - AMBIENT) / (SOFT_LIMIT - AMBIENT)
-        low = np.array([0.0] * 6 + [-box] * 3, dtype=np.float32)
-        high = np.array([np.ceil(10.0 * hottest) / 10.0] * 3 + [1.0] * 3 + [box] * 3, dtype=np.float32)
-        self.observation_space = spaces.Box(low, high, dtype=np.float32)
+    actions = 3
+    goal_space = spaces.Box(-BOX_CM, BOX_CM, (3,), np.float32)
+    observation_space = box_with_heat(3, [-BOX_CM] * 3, [BOX_CM] * 3)
 
     def core(self, lanes: int) -> Core:
-        """Return `lanes` lanes of this task's arm."""
-        return Core(presets.bending_arm(), Heater(), lanes, self.goal_size)
+        """Return `lanes` lanes of the bending module with the rest of the arm as dead weight."""
+        return Core(presets.bending_arm(), Heater(), lanes, goal_size=3)
 
-    def draw_goals(self, core: Core, rng: np.random.Generator, count: int) -> Array:
-        """Return goals (count, 3) [cm]: tips at steady temperatures drawn from this task's split."""
+    def draw(self, core: Core, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+        """Return tips (count, 3) [cm] at steady temperatures of this task's split; there is no scene."""
         goals = np.empty((count, 3))
         for i in range(count):
             settled = False
             while not settled:
-                temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * rng.random(len(core.arm.muscles))
-                if held_out(temperature) != (self.split == "held-out"):
-                    continue
-                record, good = core.settle(temperature[np.newaxis])
-                settled = bool(good[0])
+                temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * rng.random(3)
+                if self.of_this_split(temperature):
+                    record, good = core.settle(temperature[np.newaxis])
+                    settled = bool(good[0])
             goals[i] = self.achieved(record)[0]
-        return goals
+        return goals, np.empty((count, 0))
 
     def achieved(self, record: Record) -> Array:
         """Return what is compared with the goal (N, 3): tip position [cm]."""
@@ -123,16 +111,14 @@ class Reach:
 
     def observe(self, core: Core) -> Array:
         """Return what a controller measures (N, 9)."""
-        record = core.record
-        temperature = (record.temperature - AMBIENT) / (SOFT_LIMIT - AMBIENT)
-        return np.hstack([temperature, record.power / core.heating.max_power, self.achieved(record)])
+        return np.hstack([heat(core), self.achieved(core.record)])
 
     @staticmethod
     def distance(achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
         """Return the distance [cm] over the last axis."""
         return np.linalg.norm(np.asarray(achieved, dtype=np.float64) - np.asarray(desired, dtype=np.float64), axis=-1)
 
-    def success(self, achieved: NDArray[Any], desired: NDArray[Any]) -> NDArray[np.bool_]:
+    def success(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mask:
         """Return whether the goal is reached, over the last axis."""
         return self.distance(achieved, desired) <= SUCCESS_CM
 
@@ -144,8 +130,3 @@ class Reach:
         """Return what `info` reports of goals, by key."""
         return {"distance_mm": 10.0 * self.distance(achieved, desired)}
 
-
-def held_out(temperature: Array) -> bool:
-    """Return whether goals at `temperature` (n,) [degC] are held out: one cell in five, spread evenly over the space."""
-    cells = np.floor((temperature - AMBIENT) / CELL_K).astype(int)
-    return bool((cells * np.arange(1, cells.size + 1)).sum() % 5 == 0)

@@ -1,0 +1,147 @@
+"""TwistAlign: bring the gripper over a place and turn it to a yaw."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from tca_envs import presets
+from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT, Heater
+from tca_envs.tasks.core import Core, Record
+from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat, yaw
+
+SUCCESS_CM = 0.15
+"""A tip within 1.5 mm of the goal is over it ..."""
+SUCCESS_DEG = 5.0
+"""... and aligned within 5 degrees."""
+BOX_CM = 8.0
+"""No coordinate of the tip can be larger: the arm is shorter."""
+
+
+class TwistAlign(Task):
+    """Put the gripper of a soft arm over an object and align it: tip position and yaw at once.
+
+    ## Description
+
+    The bending module and, under it, the twisting module of the paper's arm hang from their base; the gripper hangs from the
+    end as dead weight. Three straight twisted-and-coiled actuators (TCAs) bend the first module, a helical one turns the
+    second: when heated, it turns the gripper one way only, counter-clockwise as seen from above. The arm is quasi-static: it is in equilibrium at every step, while the temperatures follow the heating powers
+    with a time constant of 1.8 s.
+
+    ## Action Space
+
+    `Box(-1, 1, (4,), float32)`. Finite values outside are clipped; others raise `ValueError`.
+
+    | Index | Meaning | Min (-1) | Max (+1) | Unit |
+    |---|---|---|---|---|
+    | 0..2 | heating power of bending TCA 0 (at 0 deg, +x), 1 (120 deg), 2 (240 deg) | 0 | 2 | W |
+    | 3 | heating power of the helical TCA | 0 | 4.94 | W |
+
+    A cut-off in the heaters lowers the power so that no TCA passes 158 degC.
+
+    ## Observation Space
+
+    `Dict` of float32 boxes, as goal-conditioned learners (HER) expect it. The yaw is the turn of the tip about the vertical
+    (the twist of its swing-twist decomposition); it enters as cosine and sine, which do not jump.
+
+    | Key | Index | Meaning | Min | Max | Unit |
+    |---|---|---|---|---|---|
+    | `observation` | 0..3 | (temperature - 25 degC)/125 K of each TCA | 0 | 1.1 | 1 |
+    | | 4..7 | heating power of the last step/full power | 0 | 1 | 1 |
+    | | 8..10 | tip position x, y, z in the base frame, z down | -8 | 8 | cm |
+    | | 11, 12 | cosine and sine of the tip's yaw | -1 | 1 | 1 |
+    | `achieved_goal` | 0..2 | tip position x, y, z | -8 | 8 | cm |
+    | | 3, 4 | cosine and sine of the tip's yaw | -1 | 1 | 1 |
+    | `desired_goal` | 0..4 | the same of the goal | | | |
+
+    ## Rewards
+
+    `TCATwistAlign-v0`: 0 within 1.5 mm and 5 degrees of the goal, else -1. `TCATwistAlignDense-v0`: minus the distance in cm,
+    minus 0.15 for every 5 degrees of yaw error, so that both tolerances weigh the same.
+    `compute_reward(achieved_goal, desired_goal, info)` gives the same, for one goal or a batch; it does not read `info`.
+
+    `info` (from `reset` too) holds `is_success` (within both now), `distance_mm`, `yaw_error_deg`, `energy_J` (electrical
+    energy since the episode's start), `cost` (kelvins above the soft limit of 150 degC, summed over the TCAs) and `solver`
+    (`converged`, `residual`, `iterations`).
+
+    ## Starting State
+
+    All TCAs at 25 degC, the arm hanging straight. The goal is the steady state at temperatures drawn uniformly between 25
+    and 150 degC, so that it can be reached and held; yaws lie between 0 and about -240 degrees. Where the arm could end on
+    several sides (it can buckle when a TCA is near 150 degC), other temperatures are drawn. Temperature space is dealt out
+    in cells of 25 K: a fifth of them is held out for evaluation, and training goals never come from those; they lie
+    around them, so that a policy is tested on interpolation.
+
+    ## Episode End
+
+    Truncation after 100 steps of 0.1 s. There is no termination: the goal is to be held. If the solver finds no
+    equilibrium, the last good state stays, `info["solver"]["converged"]` is False and the episode is truncated.
+
+    ## Arguments
+
+    | Name | Default | Meaning |
+    |---|---|---|
+    | `reward` | `"sparse"` (`"dense"` in TCATwistAlignDense-v0) | which reward |
+    | `split` | `"train"` | where goals come from: `"train"` or `"held-out"` |
+
+    ## Version History
+
+    * v0: first version.
+    """
+
+    actions = 4
+    goal_space = spaces.Box(
+        np.array([-BOX_CM] * 3 + [-1.0] * 2, dtype=np.float32), np.array([BOX_CM] * 3 + [1.0] * 2, dtype=np.float32)
+    )
+    observation_space = box_with_heat(4, [-BOX_CM] * 3 + [-1.0] * 2, [BOX_CM] * 3 + [1.0] * 2)
+
+    def core(self, lanes: int) -> Core:
+        """Return `lanes` lanes of the whole arm."""
+        return Core(presets.whole_arm(), Heater(), lanes, goal_size=5)
+
+    def draw(self, core: Core, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+        """Return tip positions [cm] and yaws (count, 5) at steady temperatures of this task's split; there is no scene."""
+        goals = np.empty((count, 5))
+        for i in range(count):
+            settled = False
+            while not settled:
+                temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * rng.random(4)
+                if self.of_this_split(temperature):
+                    record, good = core.settle(temperature[np.newaxis])
+                    settled = bool(good[0])
+            goals[i] = self.achieved(record)[0]
+        return goals, np.empty((count, 0))
+
+    def achieved(self, record: Record) -> Array:
+        """Return what is compared with the goal (N, 5): tip position [cm], cosine and sine of its yaw."""
+        return np.column_stack([100.0 * record.tip[:, :3, 3], *yaw(record.tip)])
+
+    def observe(self, core: Core) -> Array:
+        """Return what a controller measures (N, 13)."""
+        return np.hstack([heat(core), self.achieved(core.record)])
+
+    @staticmethod
+    def errors(achieved: NDArray[Any], desired: NDArray[Any]) -> tuple[Array, Array]:
+        """Return distance [cm] and yaw error [deg], 0 to 180, over the last axis."""
+        a, d = np.asarray(achieved, dtype=np.float64), np.asarray(desired, dtype=np.float64)
+        sine = a[..., 4] * d[..., 3] - a[..., 3] * d[..., 4]
+        cosine = a[..., 3] * d[..., 3] + a[..., 4] * d[..., 4]
+        distance = np.linalg.norm(a[..., :3] - d[..., :3], axis=-1)
+        return distance, np.degrees(np.abs(np.arctan2(sine, cosine)))
+
+    def success(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mask:
+        """Return whether tip and yaw are within their tolerances, over the last axis."""
+        distance, turn = self.errors(achieved, desired)
+        return (distance <= SUCCESS_CM) & (turn <= SUCCESS_DEG)
+
+    def dense_reward(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
+        """Return minus distance [cm] and yaw error, a tolerance of which weighs like one of distance, over the last axis."""
+        distance, turn = self.errors(achieved, desired)
+        return -distance - SUCCESS_CM / SUCCESS_DEG * turn
+
+    def measures(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mapping[str, Array]:
+        """Return what `info` reports of goals, by key."""
+        distance, turn = self.errors(achieved, desired)
+        return {"distance_mm": 10.0 * distance, "yaw_error_deg": turn}
