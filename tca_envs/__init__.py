@@ -2,7 +2,11 @@
 
 import gymnasium
 
-for _name, _task, _steps in (("TCAReach", "reach", 100), ("TCATwistAlign", "twist-align", 100)):
+for _name, _task, _steps in (
+    ("TCAReach", "reach", 100),
+    ("TCATwistAlign", "twist-align", 100),
+    ("TCAPickAndPlace", "pick-and-place", 300),
+):
     for _suffix, _reward in (("", "sparse"), ("Dense", "dense")):
         gymnasium.register(
             id=f"{_name}{_suffix}-v0",

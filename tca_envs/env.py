@@ -8,9 +8,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from tca_envs.mechanics.collocation import FAILED
 from tca_envs.mechanics.thermal import SOFT_LIMIT
 from tca_envs.tasks import TASKS
+from tca_envs.tasks.core import solved
 
 REWARDS = ("sparse", "dense")
 
@@ -78,7 +78,7 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         report = self.task.step(self.core, command[np.newaxis])[0]
         observation = self._observe()
         reward = self.compute_reward(observation["achieved_goal"], observation["desired_goal"], None)
-        return observation, reward, False, bool(report[0] == FAILED), self._info(observation, report)
+        return observation, reward, False, not solved(report), self._info(observation, report)
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
         """Return the reward of a goal (k,) as a float, or of a batch (..., k) as an array (...,); `info` is not read."""
@@ -139,7 +139,7 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
             "energy_J": float(record.energy[0]),
             "cost": float(np.maximum(record.temperature[0] - SOFT_LIMIT, 0.0).sum()),
             "solver": {
-                "converged": bool(report[0] != FAILED),
+                "converged": bool(solved(report)),
                 "residual": float(report[1]),
                 "iterations": int(report[2]),
             },

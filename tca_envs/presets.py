@@ -7,6 +7,7 @@ that add up to the arm's measured 6 g.
 from math import pi
 
 from tca_envs.mechanics import TCA, Arm, Grid, Gripper, Module, Muscle, Payload
+from tca_envs.mechanics.grasp import Box, Site
 
 YOUNGS_MODULUS = 0.125e6
 """Ecoflex 30 [Pa] (paper, section IV)."""
@@ -51,6 +52,15 @@ GRIPPER_CENTRE = (0.0, 0.0, GRIPPER_LENGTH / (2.0 * pi))
 JAW_DEPTH = GRIPPER_LENGTH / pi
 """Distance of the jaws from the twisting module's end [m]: the ring's diameter, 0.5 to 1.3 mm less than when it is open."""
 
+OBJECT = Box(width=3e-3, length=12e-3, height=8e-3, mass=1.5e-3, friction=1.1)
+"""An upright circuit board with its parts: mass and friction as measured, sides as they fit the gripper (estimate)."""
+STAGE_TRAVEL = 15e-3
+"""Of the base's vertical stage [m] (paper, section IV.B: the arm is lowered by about 10 mm)."""
+STAGE_SPEED = 10e-3
+"""[m/s] (estimate)."""
+SITE = Site(86.8e-3, STAGE_TRAVEL, GRIPPER_WIDTH, GRIPPER_THICKNESS, GRAVITY[2])
+"""The table's depth puts the object's centre 10 mm under the jaws of the cold arm (paper, Fig. 6a)."""
+
 BELOW_BENDING = Payload(TWISTING_MASS + GRIPPER_MASS, (0.0, 0.0, 12e-3))
 """Twisting module and gripper as a rigid body: centre of mass 12 mm below the bending module's tip (estimate)."""
 
@@ -76,15 +86,29 @@ def gripper(tca: TCA | None = None) -> Gripper:
     return Gripper(GRIPPER_LENGTH, GRIPPER_STIFFNESS, axial, GRIPPER_OFFSET, tca or TCA())
 
 
-def whole_arm(tca: TCA | None = None) -> Arm:
-    """Return bending and twisting module in series with the gripper's weight at the end.
+def with_object(along: float = 0.0, drop: float = 0.0) -> Payload:
+    """Return the gripper with the object in its jaws as a payload of the whole arm.
+
+    Parameters
+    ----------
+    along, drop : float
+        Place of the object's centre along the jaws' width and below them [m].
+    """
+    mass = GRIPPER_MASS + OBJECT.mass
+    depth = (GRIPPER_MASS * GRIPPER_CENTRE[2] + OBJECT.mass * (JAW_DEPTH + drop)) / mass
+    return Payload(mass, (0.0, OBJECT.mass / mass * along, depth))
+
+
+def whole_arm(tca: TCA | None = None, payload: Payload | None = None) -> Arm:
+    """Return bending and twisting module in series with the gripper's weight at the end, or another payload.
 
     The strain of a helical muscle's module turns with the muscle, so that module has six elements, less than a turn each.
     The tip lies within 10 um of that of a grid ten times finer at all temperatures up to the heaters' cut-off
     (tests/test_benchmark.py); a smaller tolerance would not bring it nearer.
     """
     modules = [bending_module(tca), twisting_module(tca)]
-    return Arm(modules, GRAVITY, Payload(GRIPPER_MASS, GRIPPER_CENTRE), [Grid(1, 7), Grid(6, 4)], tolerance=1e-5)
+    hanging = payload or Payload(GRIPPER_MASS, GRIPPER_CENTRE)
+    return Arm(modules, GRAVITY, hanging, [Grid(1, 7), Grid(6, 4)], tolerance=1e-5)
 
 
 def bending_arm(tca: TCA | None = None) -> Arm:

@@ -70,6 +70,11 @@ class Record:
             getattr(self, f.name)[lanes] = getattr(source, f.name)
 
 
+def solved(report: Array) -> NDArray[np.bool_]:
+    """Return which lanes of a report (..., 3) of `Core.step` have an equilibrium."""
+    return np.asarray(report[..., 0] != FAILED)
+
+
 class Core:
     """N lanes of one arm.
 
@@ -114,7 +119,7 @@ class Core:
             scene=np.zeros((1, scene_size)),
         )
         report = self._solve(record, ambient.copy())
-        if report[0, 0] == FAILED:
+        if not solved(report).all():
             raise RuntimeError(f"the arm has no equilibrium at {self.heating.ambient:g} degC to start from")
         return record, report
 
@@ -128,7 +133,7 @@ class Core:
             self.arm.model, record.strain, record.tension, record.drive, record.load, drive, load,
             record.tip, record.length, report,
         )  # fmt: skip
-        good = report[:, 0] != FAILED
+        good = solved(report)
         record.temperature[good] = temperature[good]
         return report
 
@@ -156,7 +161,7 @@ class Core:
         allowed = thermal.power_to_reach(record.temperature, CUT_OFF, STEP_S, heating)
         power = np.minimum(asked, np.maximum(allowed, 0.0))
         report = self._solve(record, thermal.step(record.temperature, power, STEP_S, heating))
-        good = report[:, 0] != FAILED
+        good = solved(report)
         record.power[good] = power[good]
         record.energy[good] += power[good].sum(axis=1) * STEP_S
         return report
@@ -189,7 +194,7 @@ class Core:
                 record.payload[:] = payload
             for done in np.arange(1, steps + 1) / steps:
                 report = self._solve(record, self.heating.ambient + done * (target - self.heating.ambient))
-                good &= report[:, 0] != FAILED
+                good &= solved(report)
             tips.append(record.tip[:, :3, 3])
         good &= np.linalg.norm(tips[0] - tips[1], axis=1) < SAME_TIP
         return record, good

@@ -1,0 +1,231 @@
+"""PickAndPlace: grasp an object on the table and put it down elsewhere."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from tca_envs import presets
+from tca_envs.mechanics import grasp
+from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT, Heater
+from tca_envs.tasks.core import STEP_S, Core, Record, solved
+from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat, yaw
+
+SUCCESS_CM = 0.3
+"""An object at rest within 3 mm of the target, the gripper clear of it, is placed."""
+APART_CM = 0.6
+"""The target lies at least this far from the object's first place."""
+HOTTEST_OBJECT = np.array([100.0, 100.0, 100.0, 125.0])
+"""The object's first place is under the gripper at temperatures up to these [degC] ..."""
+HOTTEST_TARGET = np.array([120.0, 120.0, 120.0, AMBIENT])
+"""... and the target under that of an arm that carries it at temperatures up to these, untwisted."""
+BOX_CM = 10.0
+"""No coordinate of tool or object can be larger."""
+FULL_FORCE = 0.05
+"""Unit of the observed pinch force [N]."""
+
+
+class PickAndPlace(Task):
+    """Grasp an object under the arm, lift it, and put it down at a target: with heat, friction and a vertical stage.
+
+    ## Description
+
+    The whole arm of the paper: three twisted-and-coiled actuators (TCAs) bend it, a helical one turns the gripper (one way
+    only), a fifth one opens the gripper's ring, and a stage moves the base up and down. An upright board (3 mm wide, 12 mm
+    long, 8 mm high, 1.5 g) stands on a table, its centre 10 mm under the jaws of the cold arm.
+
+    Grasping follows from physics. The jaws go down over the object only where their gap is wider than the object as it lies to them;
+    otherwise the stage stops on its top. Closing jaws push the object to their middle and turn it into line. It is held as long
+    as friction carries its weight, 2 mu N >= m g, with the pinch force N of the cooling ring; its weight then loads the arm.
+    When the jaws open it falls straight down and stays where it lands.
+
+    The arm is quasi-static: it is in equilibrium at every step, while the temperatures follow the heating powers with a time
+    constant of 1.8 s. Not modelled: contact between arm and table beyond a stop of the stage, sides of the jaws that push an
+    object which is not between them, impact, tilting and rolling of the object, the jaws' tilt in contacts, the 1 mm by which the ring's height changes.
+
+    ## Action Space
+
+    `Box(-1, 1, (6,), float32)`. Finite values outside are clipped; others raise `ValueError`.
+
+    | Index | Meaning | Min (-1) | Max (+1) | Unit |
+    |---|---|---|---|---|
+    | 0..2 | heating power of bending TCA 0 (at 0 deg, +x), 1 (120 deg), 2 (240 deg) | 0 | 2 | W |
+    | 3 | heating power of the helical TCA | 0 | 4.94 | W |
+    | 4 | heating power of the gripper's TCA | 0 | 2.25 | W |
+    | 5 | speed of the stage, positive down | -10 | 10 | mm/s |
+
+    A cut-off in the heaters lowers the power so that no TCA passes 158 degC. The stage travels 15 mm.
+
+    ## Observation Space
+
+    `Dict` of float32 boxes, as goal-conditioned learners (HER) expect it. "Tool" is the point between the jaws.
+
+    | Key | Index | Meaning | Min | Max | Unit |
+    |---|---|---|---|---|---|
+    | `observation` | 0..4 | (temperature - 25 degC)/125 K of each TCA | 0 | 1.1 | 1 |
+    | | 5..9 | heating power of the last step/full power | 0 | 1 | 1 |
+    | | 10..12 | tool position x, y, z in the frame of the raised base, z down | -10 | 10 | cm |
+    | | 13, 14 | cosine and sine of the tool's yaw | -1 | 1 | 1 |
+    | | 15 | travel of the stage/15 mm, 1 is down | 0 | 1 | 1 |
+    | | 16 | opening of the jaws | 0 | 1 | cm |
+    | | 17 | pinch force on the object/50 mN | 0 | 1 | 1 |
+    | | 18..20 | object position x, y, z (its centre) | -10 | 10 | cm |
+    | | 21, 22 | cosine and sine of twice the object's yaw | -1 | 1 | 1 |
+    | `achieved_goal` | 0..2 | object position x, y, z | -10 | 10 | cm |
+    | | 3 | 1 if it rests on the table and the gripper is clear of it, else 0 | 0 | 1 | 1 |
+    | `desired_goal` | 0..2 | target position x, y, z | -10 | 10 | cm |
+    | | 3 | 1 | 0 | 1 | 1 |
+
+    ## Rewards
+
+    `TCAPickAndPlace-v0`: 0 where the object rests within 3 mm of the target with the gripper clear of it, else -1.
+    `TCAPickAndPlaceDense-v0`: minus the distance of object and target in cm.
+    `compute_reward(achieved_goal, desired_goal, info)` gives the same, for one goal or a batch; it does not read `info`.
+
+    `info` (from `reset` too) holds `is_success` (placed now), `distance_mm`, `energy_J` (electrical energy of heating since
+    the episode's start), `cost` (kelvins above the soft limit of 150 degC, summed over the TCAs) and `solver`
+    (`converged`, `residual`, `iterations`).
+
+    ## Starting State
+
+    All TCAs at 25 degC, the arm hanging straight, the stage up. The object lies under the tool of a steady state, with its
+    yaw: at bending temperatures drawn uniformly between 25 and 100 degC and a twisting temperature between 25 and 125 degC (yaws
+    down to about -150 degrees). The target lies under an object carried by an untwisted arm at bending temperatures
+    between 25 and 120 degC, at least 6 mm away. Temperature space (of the seven temperatures) is dealt out in cells of
+    25 K: a fifth of them is held out for evaluation, and training episodes never come from those.
+
+    ## Episode End
+
+    Truncation after 300 steps of 0.1 s. There is no termination: the object is to stay. If the solver finds no
+    equilibrium, the last good state stays, `info["solver"]["converged"]` is False and the episode is truncated.
+
+    ## Arguments
+
+    | Name | Default | Meaning |
+    |---|---|---|
+    | `reward` | `"sparse"` (`"dense"` in TCAPickAndPlaceDense-v0) | which reward |
+    | `split` | `"train"` | where episodes come from: `"train"` or `"held-out"` |
+
+    ## Version History
+
+    * v0: first version.
+    """
+
+    actions = 6
+    goal_space = spaces.Box(
+        np.array([-BOX_CM] * 3 + [0.0], dtype=np.float32), np.array([BOX_CM] * 3 + [1.0], dtype=np.float32)
+    )
+    observation_space = box_with_heat(
+        5,
+        [-BOX_CM] * 3 + [-1.0] * 2 + [0.0] * 3 + [-BOX_CM] * 3 + [-1.0] * 2,
+        [BOX_CM] * 3 + [1.0] * 5 + [BOX_CM] * 3 + [1.0] * 2,
+    )
+
+    def __init__(self, split: str) -> None:
+        super().__init__(split)
+        self.gripper = presets.gripper()
+        self._pinch_at = np.arange(AMBIENT, HARD_LIMIT + 1.0)
+        self._pinch = self.gripper.pinch(self._pinch_at, presets.OBJECT.width)
+
+    def core(self, lanes: int) -> Core:
+        """Return `lanes` lanes of the whole arm; the gripper's TCA is heated, too."""
+        return Core(presets.whole_arm(), Heater(), lanes, 4, grasp.SCENE, [self.gripper.rest_length])
+
+    def draw(self, core: Core, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+        """Return targets (count, 4) and scenes (count, SCENE) with the object under the tool of a steady state."""
+        rest = grasp.resting(presets.OBJECT, presets.SITE)
+        carrying = presets.with_object()
+        goals = np.tile([0.0, 0.0, 100.0 * rest, 1.0], (count, 1))
+        scenes = np.zeros((count, grasp.SCENE))
+        scenes[:, grasp.Z] = rest
+        for i in range(count):
+            far = False
+            while not far:
+                first = AMBIENT + (HOTTEST_OBJECT - AMBIENT) * rng.random(4)
+                last = AMBIENT + (HOTTEST_TARGET - AMBIENT) * rng.random(4)
+                if self.of_this_split(np.append(first, last[:3])):
+                    here, good_here = core.settle(first[np.newaxis])
+                    there, good_there = core.settle(last[np.newaxis], np.array([carrying.mass, *carrying.centre]))
+                    scenes[i, grasp.X : grasp.Z] = tool(here)[0, :2]
+                    goals[i, :2] = 100.0 * tool(there)[0, :2]
+                    apart = np.linalg.norm(goals[i, :2] - 100.0 * scenes[i, grasp.X : grasp.Z])
+                    far = bool(good_here[0] and good_there[0] and apart >= APART_CM)
+            scenes[i, grasp.YAW] = grasp.half_turn(heading(here))[0]
+        return goals, scenes
+
+    def step(self, core: Core, action: Array) -> Array:
+        """Heat by the first five numbers of the actions (N, 6), then move the stage and let jaws and object act."""
+        report = core.step(action[:, :5])
+        record = core.record
+        lowering = presets.STAGE_SPEED * STEP_S * np.clip(action[:, 5], -1.0, 1.0)
+        gap, pinch = self.gripper.gap(record.temperature[:, 4]), self.pinch(record)
+        scene = grasp.step(record.scene, tool(record), heading(record), gap, pinch, lowering, presets.OBJECT, presets.SITE)
+        record.scene[:] = np.where(solved(report)[:, np.newaxis], scene, record.scene)
+        record.payload[:] = core.rest.payload
+        for lane in np.flatnonzero(record.scene[:, grasp.HELD]):
+            hanging = presets.with_object(record.scene[lane, grasp.ALONG], record.scene[lane, grasp.DROP])
+            record.payload[lane] = (hanging.mass, *hanging.centre)
+        return report
+
+    def pinch(self, record: Record) -> Array:
+        """Return the force (N,) with which each jaw would press on the object between them [N]."""
+        return np.interp(record.temperature[:, 4], self._pinch_at, self._pinch)
+
+    def achieved(self, record: Record) -> Array:
+        """Return what is compared with the goal (N, 4): object position [cm] and whether it lies there free."""
+        scene = record.scene
+        free = (scene[:, grasp.HELD] < 0.5) & (scene[:, grasp.ASTRIDE] < 0.5)
+        return np.column_stack([100.0 * scene[:, grasp.X : grasp.Z + 1], free])
+
+    def observe(self, core: Core) -> Array:
+        """Return what a controller measures (N, 23)."""
+        record, scene = core.record, core.record.scene
+        between = (scene[:, grasp.HELD] > 0.5) | (scene[:, grasp.ASTRIDE] > 0.5)
+        gap = self.gripper.gap(record.temperature[:, 4])
+        opening = np.where(between, np.maximum(gap, presets.OBJECT.width), gap)
+        place = tool(record)
+        place[:, 2] += scene[:, grasp.STAGE]
+        return np.column_stack(
+            [
+                heat(core),
+                100.0 * place,
+                *yaw(record.tip),
+                scene[:, grasp.STAGE] / presets.STAGE_TRAVEL,
+                100.0 * opening,
+                np.where(between, self.pinch(record), 0.0) / FULL_FORCE,
+                100.0 * scene[:, grasp.X : grasp.Z + 1],
+                np.cos(2.0 * scene[:, grasp.YAW]),
+                np.sin(2.0 * scene[:, grasp.YAW]),
+            ]
+        )
+
+    @staticmethod
+    def distance(achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
+        """Return the distance of object and target [cm] over the last axis."""
+        a, d = np.asarray(achieved, dtype=np.float64), np.asarray(desired, dtype=np.float64)
+        return np.linalg.norm(a[..., :3] - d[..., :3], axis=-1)
+
+    def success(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mask:
+        """Return whether the object lies free within the tolerance of the target, over the last axis."""
+        return (self.distance(achieved, desired) <= SUCCESS_CM) & (np.asarray(achieved)[..., 3] > 0.5)
+
+    def dense_reward(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
+        """Return minus the distance [cm] over the last axis."""
+        return -self.distance(achieved, desired)
+
+    def measures(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mapping[str, Array]:
+        """Return what `info` reports of goals, by key."""
+        return {"distance_mm": 10.0 * self.distance(achieved, desired)}
+
+
+def tool(record: Record) -> Array:
+    """Return the points between the jaws (N, 3) with the stage up [m]."""
+    return record.tip[:, :3, 3] + presets.JAW_DEPTH * record.tip[:, :3, 2]
+
+
+def heading(record: Record) -> Array:
+    """Return the directions in which the jaws open (N,) [rad]: the tip's x axis."""
+    cosine, sine = yaw(record.tip)
+    return np.arctan2(sine, cosine)
