@@ -149,10 +149,12 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 def learner(algorithm: str) -> Any:
-    """Return the Stable-Baselines3 class of an algorithm."""
+    """Return the class of an algorithm: Stable-Baselines3's or our own in its form."""
     import stable_baselines3
 
-    return getattr(stable_baselines3, algorithm.upper())
+    from agents.dagger import DAgger
+
+    return DAgger if algorithm == "dagger" else getattr(stable_baselines3, algorithm.upper())
 
 
 def environments(settings: dict[str, Any], seed: int) -> Any:

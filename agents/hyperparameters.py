@@ -1,11 +1,19 @@
-"""Training settings per task and algorithm: SAC's are tuned for two CPU cores, PPO's are a start."""
+"""Training settings per task and algorithm: the default algorithms' are tuned for two CPU cores, PPO's are a start."""
 
 from typing import Any
 
-ALGORITHMS = ("sac", "ppo")
-"""Names of the Stable-Baselines3 learners that `train.py` offers."""
+from torch.nn import ReLU
 
-DEFAULT_ALGORITHM = {"reach": "sac", "twist-align": "sac"}
+
+def decaying(remaining: float) -> float:
+    """Return the learning rate when the part `remaining` of the training is left: 1e-3, at the end 1e-4."""
+    return 1e-3 * 10.0 ** (remaining - 1.0)
+
+
+ALGORITHMS = ("sac", "ppo", "dagger")
+"""Learners that `train.py` offers: Stable-Baselines3's, and imitation of the scripted controller (`agents.dagger`)."""
+
+DEFAULT_ALGORITHM = {"reach": "sac", "twist-align": "sac", "pick-and-place": "dagger"}
 
 HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
     "reach": {
@@ -60,6 +68,44 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
             "n_epochs": 8,
             "gamma": 0.95,
             "gae_lambda": 0.9,
+        },
+    },
+    "pick-and-place": {
+        "sac": {
+            "env": "TCAPickAndPlaceDense-v0",
+            "steps": 300_000,
+            "envs": 4,
+            "policy_kwargs": {"net_arch": [256, 256]},
+            "learning_rate": 1e-3,
+            "batch_size": 256,
+            "gamma": 0.99,
+            "learning_starts": 10_000,
+            "train_freq": 1,
+            "gradient_steps": 1,
+            "buffer_size": 300_000,
+        },
+        "ppo": {
+            "env": "TCAPickAndPlaceDense-v0",
+            "steps": 3_000_000,
+            "envs": 8,
+            "policy_kwargs": {"net_arch": [256, 256], "log_std_init": -0.5},
+            "learning_rate": 3e-4,
+            "n_steps": 600,
+            "batch_size": 600,
+            "n_epochs": 8,
+            "gamma": 0.99,
+            "gae_lambda": 0.95,
+        },
+        "dagger": {
+            "env": "TCAPickAndPlaceDense-v0",
+            "steps": 300_000,
+            "envs": 10,
+            "controller": "pick-and-place",
+            "policy_kwargs": {"net_arch": {"pi": [256, 256], "vf": [1]}, "activation_fn": ReLU},
+            "learning_rate": decaying,
+            "n_steps": 1_500,
+            "batch_size": 512,
+            "n_epochs": 12,
         },
     },
 }

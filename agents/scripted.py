@@ -5,15 +5,17 @@ runs a trained policy runs them too.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tca_envs import presets
-from tca_envs.mechanics import Arm, Equilibrium, thermal
+from tca_envs.mechanics import Arm, Equilibrium, grasp, thermal
 from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT, Heater
 from tca_envs.tasks.core import STEP_S
+from tca_envs.tasks.pick_and_place import FULL_FORCE
 from tca_envs.tasks.task import yaw
 from tca_envs.tasks.twist_align import SUCCESS_CM, SUCCESS_DEG
 
@@ -92,6 +94,156 @@ class TwistAlignController(SteadyController):
         return plan(self.arm, tip_and_yaw_at(goal[:3] / 100.0, turn), starts)
 
 
+class PickAndPlaceController:
+    """Solves TCAPickAndPlace: the sequence of the paper's Fig. 6 as a state machine.
+
+    The state is read off the observation at every step, so that a slip or a missed grasp leads back to where it belongs:
+
+    1. `align`: bend and twist until the tool is over the object with its yaw;
+    2. `open`: heat the gripper until the object fits between the jaws;
+    3. `lower`: until the jaws are around the object's middle;
+    4. `close`: let the gripper cool until friction holds the object;
+    5. `lift`: the stage up;
+    6. `untwist`: the helix cools;
+    7. `carry`: bend until the object is over the target;
+    8. `release`: heat the gripper until the object falls;
+    9. `leave`: open jaws go up, everything cools.
+
+    Plans are Gauss-Newton on the arm's model, anew where the object or the target has moved.
+    """
+
+    def __init__(self) -> None:
+        self.arm = presets.whole_arm()
+        self.carrying = presets.whole_arm(payload=presets.with_object())
+        self.gripper = presets.gripper()
+        self.heating = Heater().scaled(np.append(self.arm.rest_lengths, self.gripper.rest_length))
+        self.plans: dict[str, tuple[Array, Array]] = {}
+
+    def predict(
+        self,
+        observation: dict[str, NDArray[Any]],
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], None]:
+        """Return the action (6,) for an observation of TCAPickAndPlace; the other arguments are SB3's and not read."""
+        scene = Sight.of(observation)
+        phase = self.phase(scene)
+        temperature = scene.temperature
+        if phase in ("carry", "release"):
+            bent = self._plan("target", scene.target)
+        elif phase == "untwist":
+            bent = np.append(temperature[:3], AMBIENT)
+        elif phase in ("close", "lift") or (phase == "leave" and scene.low):
+            bent = temperature[:4]  # the arm stays where it is
+        elif phase == "leave":
+            bent = np.full(4, AMBIENT)
+        else:
+            bent = self._plan("object", np.append(scene.object[:2], scene.object_yaw))
+        wide_open = phase in ("open", "lower", "release") or (phase == "leave" and scene.low)
+        jaws = OPEN if wide_open else AMBIENT
+        speed = {"lower": 1.0, "open": 0.0, "close": 0.0, "release": 0.0}.get(phase, -1.0)
+        arm = thermal.Heating(*(values[:4] for values in self.heating[:3]))
+        gripper = thermal.Heating(*(values[4:] for values in self.heating[:3]))
+        action = [*drive(temperature[:4], bent, arm), *drive(temperature[4:], np.array([jaws]), gripper), speed]
+        return np.array(action, dtype=np.float32), None
+
+    def phase(self, scene: "Sight") -> str:
+        """Return the name of the phase that an observation belongs to."""
+        if scene.held:
+            if np.linalg.norm(scene.object[:2] - scene.target) < OVER_TARGET and scene.stage < 0.1:
+                return "release"
+            if scene.stage >= 0.1:
+                return "lift"
+            return "carry" if abs(scene.yaw) < UNTWISTED else "untwist"
+        if np.linalg.norm(scene.object[:2] - scene.target) < PLACED:
+            return "leave"
+        tool, turn = scene.tool, abs(grasp.half_turn(scene.object_yaw - scene.yaw))
+        beside = float(np.linalg.norm(scene.object[:2] - tool[:2]))
+        if scene.between and tool[2] > scene.object[2] - GRASP_DEPTH:
+            return "close"
+        needed = 2.0 * (float(grasp.half_extents(np.array(turn), presets.OBJECT)[0]) + beside) + MARGIN
+        if scene.low:
+            return "lower" if scene.gap > needed else "align"
+        if beside > ALIGNED or turn > ALIGNED_YAW:
+            return "align"
+        return "lower" if scene.gap > needed else "open"
+
+    def _plan(self, name: str, goal: Array) -> Array:
+        """Return the temperatures (4,) [degC] that bring the tool to `goal`: x, y [m] and perhaps a yaw [rad] modulo 180 deg."""
+        known, temperatures = self.plans.get(name, (None, None))
+        if known is None or temperatures is None or np.abs(goal - known).max() > SAME_PLACE:
+            arm = self.carrying if name == "target" else self.arm
+            twist, turn = AMBIENT, None
+            if len(goal) == 3:
+                turn = LEAST_TURN - (LEAST_TURN - goal[2]) % np.pi
+                twist = helix_temperature(arm, turn)
+            starts = np.column_stack([BENDING_STARTS, np.full(len(BENDING_STARTS), twist)])
+            temperatures = plan(arm, tool_at(goal[:2], turn), starts)
+            self.plans[name] = goal, temperatures
+        return temperatures
+
+
+OPEN = 147.0
+"""Temperature of the open gripper [degC]."""
+ALIGNED, ALIGNED_YAW = 5e-4, np.radians(4.0)
+"""Errors of the tool [m], [rad] at which the gripper opens and goes down."""
+MARGIN = 4e-4
+"""Spare gap of the jaws [m]."""
+GRASP_DEPTH = 1.5e-3
+"""The jaws close when they are no higher above the object's centre [m]."""
+OVER_TARGET, PLACED = 1e-3, 2.5e-3
+"""Errors of the object [m] at which it is released, and at which it is left."""
+UNTWISTED = np.radians(15.0)
+"""Yaw of the tool [rad] that counts as the original one."""
+SAME_PLACE = 2e-4
+"""An object that moved less [m], turned less [rad], needs no new plan."""
+LEAST_TURN = np.radians(5.0)
+"""Of the yaws that fit, the first below this one needs the least heat [rad]."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a controller sees in an observation of TCAPickAndPlace, in SI units and degC."""
+
+    temperature: Array
+    tool: Array
+    yaw: float
+    stage: float
+    """From 0 (up) to 1 (down)."""
+    gap: float
+    held: bool
+    between: bool
+    """Whether the jaws are around the object, holding or not."""
+    low: bool
+    """Whether the jaws are below the object's top."""
+    object: Array
+    object_yaw: float
+    target: Array
+
+    @classmethod
+    def of(cls, observation: dict[str, NDArray[Any]]) -> "Sight":
+        """Return what `observation` says."""
+        seen = np.asarray(observation["observation"], dtype=np.float64)
+        place, tool = seen[18:21] / 100.0, seen[10:13] / 100.0
+        force = np.array(FULL_FORCE * seen[17])
+        held = bool(grasp.holds(force, presets.OBJECT, presets.SITE))
+        low = bool(tool[2] > place[2] - 0.5 * presets.OBJECT.height)
+        return cls(
+            temperature=AMBIENT + (SOFT_LIMIT - AMBIENT) * seen[:5],
+            tool=tool,
+            yaw=float(np.arctan2(seen[14], seen[13])),
+            stage=float(seen[15]),
+            gap=float(seen[16]) / 100.0,
+            held=held,
+            between=low and observation["achieved_goal"][3] < 0.5,
+            low=low,
+            object=place,
+            object_yaw=0.5 * float(np.arctan2(seen[22], seen[21])),
+            target=np.asarray(observation["desired_goal"][:2], dtype=np.float64) / 100.0,
+        )
+
+
 def drive(temperature: Array, target: Array, heating: thermal.Heating) -> Array:
     """Return the action (n,) that takes TCAs from `temperature` towards `target` (n,) [degC], on the straight way from ambient.
 
@@ -121,6 +273,23 @@ def tip_and_yaw_at(goal: Array, turn: float) -> Aim:
         jacobian = here.tip_jacobian
         missing = np.append(goal - here.tip_pose[:3, 3], METRES_PER_RADIAN * (turn - yaw_of(here)))
         return missing, np.vstack([jacobian[:3], METRES_PER_RADIAN * yaw_gradient(here.tip_pose) @ jacobian[3:]])
+
+    return aim
+
+
+def tool_at(goal: Array, turn: float | None) -> Aim:
+    """Return the aim of a horizontal place of the tool (2,) [m] and a yaw [rad]; without one the helix stays as it is."""
+
+    def aim(here: Equilibrium) -> tuple[Array, Array]:
+        pose, jacobian = here.tip_pose, here.tip_jacobian
+        lever = presets.JAW_DEPTH * pose[:3, 2]
+        place = jacobian[:3] + np.cross(jacobian[3:], lever, axis=0)
+        missing = goal - (pose[:3, 3] + lever)[:2]
+        if turn is None:
+            place[:, -1] = 0.0
+            return missing, place[:2]
+        yaws = METRES_PER_RADIAN * yaw_gradient(pose) @ jacobian[3:]
+        return np.append(missing, METRES_PER_RADIAN * (turn - yaw_of(here))), np.vstack([place[:2], yaws])
 
     return aim
 
@@ -231,5 +400,5 @@ class RandomPolicy:
         return self.rng.uniform(-1.0, 1.0, self.size).astype(np.float32), None
 
 
-CONTROLLERS = {"reach": ReachController, "twist-align": TwistAlignController}
+CONTROLLERS = {"reach": ReachController, "twist-align": TwistAlignController, "pick-and-place": PickAndPlaceController}
 """Scripted controller of each task."""

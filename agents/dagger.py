@@ -1,0 +1,103 @@
+"""DAgger: a policy learns what a scripted controller would do in the situations that the policy itself comes into.
+
+S. Ross, G. Gordon and D. Bagnell, "A reduction of imitation learning and structured prediction to no-regret online learning",
+AISTATS 2011. The first round is driven by the controller, later ones by the policy; the controller's actions are
+recorded everywhere, and after every round the policy is fitted to all that has been recorded.
+"""
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.type_aliases import MaybeCallback
+
+from agents.scripted import CONTROLLERS
+
+Observations = dict[str, NDArray[np.float32]]
+
+
+class DAgger(PPO):
+    """PPO's networks, saved and loaded like PPO's, fitted to a scripted controller instead.
+
+    Parameters
+    ----------
+    policy, env, **options
+        As of Stable-Baselines3's `PPO`; `n_steps` are the steps of each environment in a round, `n_epochs` the passes
+        over the record after it.
+    controller : str
+        Key of `agents.scripted.CONTROLLERS`.
+    """
+
+    def __init__(self, policy: Any, env: Any, controller: str | None = None, **options: Any) -> None:
+        self.controller = controller
+        self.record: list[tuple[Observations, NDArray[np.float32]]] = []
+        super().__init__(policy, env, **options)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "record"]
+
+    def save_replay_buffer(self, path: Path) -> None:
+        """Save what has been recorded, so that a run can go on."""
+        Path(path).write_bytes(pickle.dumps(self.record))
+
+    def load_replay_buffer(self, path: Path) -> None:
+        """Load what `save_replay_buffer` saved."""
+        self.record = pickle.loads(Path(path).read_bytes())
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "DAgger",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> "DAgger":
+        """Run rounds until `total_timesteps` more steps are done; see `BaseAlgorithm.learn`."""
+        total_timesteps, callbacks = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        assert self.env is not None and self.controller is not None
+        experts = [CONTROLLERS[self.controller]() for _ in range(self.env.num_envs)]
+        callbacks.on_training_start(locals(), globals())
+        observation = self.env.reset()
+        going_on = True
+        while going_on and self.num_timesteps < total_timesteps:
+            by_expert = not self.record
+            for _ in range(self.n_steps):
+                assert isinstance(observation, dict)
+                lanes = [{key: value[i] for key, value in observation.items()} for i in range(len(experts))]
+                wanted = np.array([expert.predict(lane)[0] for expert, lane in zip(experts, lanes, strict=True)])
+                self.record.append(({key: value.copy() for key, value in observation.items()}, wanted))
+                action = wanted if by_expert else self.predict(observation, deterministic=True)[0]
+                observation, _, _, _ = self.env.step(action)
+                self.num_timesteps += self.env.num_envs
+                going_on = callbacks.on_step()
+                if not going_on or self.num_timesteps >= total_timesteps:
+                    break
+            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+            self._fit()
+        callbacks.on_training_end()
+        return self
+
+    def _fit(self) -> None:
+        """Fit the mean action to the record by least squares."""
+        keys = self.record[0][0].keys()
+        seen = {key: torch.as_tensor(np.concatenate([o[key] for o, _ in self.record]), device=self.device) for key in keys}
+        wanted = torch.as_tensor(np.concatenate([a for _, a in self.record]), device=self.device)
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        generator = torch.Generator().manual_seed(self.num_timesteps + (self.seed or 0))
+        for _ in range(self.n_epochs):
+            for batch in torch.randperm(len(wanted), generator=generator).split(self.batch_size):
+                mean = self.policy.get_distribution({key: value[batch] for key, value in seen.items()}).distribution.mean
+                loss = torch.nn.functional.mse_loss(mean, wanted[batch])
+                self.policy.optimizer.zero_grad()
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+                self.policy.optimizer.step()
+        self.policy.set_training_mode(False)
