@@ -35,6 +35,7 @@ class DAgger(PPO):
     def __init__(self, policy: Any, env: Any, controller: str | None = None, **options: Any) -> None:
         self.controller = controller
         self.record: list[tuple[Observations, NDArray[np.float32]]] = []
+        options["policy_kwargs"] = {"activation_fn": torch.nn.ReLU, **(options.get("policy_kwargs") or {})}
         super().__init__(policy, env, **options)
 
     def _excluded_save_params(self) -> list[str]:
@@ -94,8 +95,8 @@ class DAgger(PPO):
         generator = torch.Generator().manual_seed(self.num_timesteps + (self.seed or 0))
         for _ in range(self.n_epochs):
             for batch in torch.randperm(len(wanted), generator=generator).split(self.batch_size):
-                mean = self.policy.get_distribution({key: value[batch] for key, value in seen.items()}).distribution.mean
-                loss = torch.nn.functional.mse_loss(mean, wanted[batch])
+                distribution = self.policy.get_distribution({key: value[batch] for key, value in seen.items()})
+                loss = torch.nn.functional.mse_loss(distribution.mode(), wanted[batch])
                 self.policy.optimizer.zero_grad()
                 loss.backward()
                 torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)

@@ -2,8 +2,6 @@
 
 from typing import Any
 
-from torch.nn import ReLU
-
 
 def decaying(remaining: float) -> float:
     """Return the learning rate when the part `remaining` of the training is left: 1e-3, at the end 1e-4."""
@@ -101,7 +99,7 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
             "steps": 300_000,
             "envs": 10,
             "controller": "pick-and-place",
-            "policy_kwargs": {"net_arch": {"pi": [256, 256], "vf": [1]}, "activation_fn": ReLU},
+            "policy_kwargs": {"net_arch": {"pi": [256, 256], "vf": [1]}},
             "learning_rate": decaying,
             "n_steps": 1_500,
             "batch_size": 512,

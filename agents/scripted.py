@@ -143,9 +143,8 @@ class PickAndPlaceController:
         wide_open = phase in ("open", "lower", "release") or (phase == "leave" and scene.low)
         jaws = OPEN if wide_open else AMBIENT
         speed = {"lower": 1.0, "open": 0.0, "close": 0.0, "release": 0.0}.get(phase, -1.0)
-        arm = thermal.Heating(*(values[:4] for values in self.heating[:3]))
-        gripper = thermal.Heating(*(values[4:] for values in self.heating[:3]))
-        action = [*drive(temperature[:4], bent, arm), *drive(temperature[4:], np.array([jaws]), gripper), speed]
+        bending, opening = self.heating.part(slice(4)), self.heating.part(slice(4, 5))
+        action = [*drive(temperature[:4], bent, bending), *drive(temperature[4:], np.array([jaws]), opening), speed]
         return np.array(action, dtype=np.float32), None
 
     def phase(self, scene: "Sight") -> str:
@@ -158,7 +157,7 @@ class PickAndPlaceController:
             return "carry" if abs(scene.yaw) < UNTWISTED else "untwist"
         if np.linalg.norm(scene.object[:2] - scene.target) < PLACED:
             return "leave"
-        tool, turn = scene.tool, abs(grasp.half_turn(scene.object_yaw - scene.yaw))
+        tool, turn = scene.tool, abs(float(grasp.half_turn(np.array(scene.object_yaw - scene.yaw))))
         beside = float(np.linalg.norm(scene.object[:2] - tool[:2]))
         if scene.between and tool[2] > scene.object[2] - GRASP_DEPTH:
             return "close"
@@ -170,7 +169,7 @@ class PickAndPlaceController:
         return "lower" if scene.gap > needed else "open"
 
     def _plan(self, name: str, goal: Array) -> Array:
-        """Return the temperatures (4,) [degC] that bring the tool to `goal`: x, y [m] and perhaps a yaw [rad] modulo 180 deg."""
+        """Return the temperatures (4,) [degC] that bring the tool to `goal`: x, y [m] and perhaps a yaw [rad] modulo pi."""
         known, temperatures = self.plans.get(name, (None, None))
         if known is None or temperatures is None or np.abs(goal - known).max() > SAME_PLACE:
             arm = self.carrying if name == "target" else self.arm
@@ -400,5 +399,9 @@ class RandomPolicy:
         return self.rng.uniform(-1.0, 1.0, self.size).astype(np.float32), None
 
 
-CONTROLLERS = {"reach": ReachController, "twist-align": TwistAlignController, "pick-and-place": PickAndPlaceController}
+CONTROLLERS: dict[str, Callable[[], SteadyController | PickAndPlaceController]] = {
+    "reach": ReachController,
+    "twist-align": TwistAlignController,
+    "pick-and-place": PickAndPlaceController,
+}
 """Scripted controller of each task."""

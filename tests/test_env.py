@@ -47,7 +47,9 @@ def assert_same(first, second):
 
 
 def test_the_registry_holds_the_environments():
-    assert IDS == ["TCAReach-v0", "TCAReachDense-v0"]
+    assert IDS == sorted(
+        f"TCA{task}{reward}-v0" for task in ("Reach", "TwistAlign", "PickAndPlace") for reward in ("", "Dense")
+    )
 
 
 def test_checkers_pass_without_a_warning(env):
@@ -62,10 +64,11 @@ def test_spec_survives_json(env):
     assert gym.make(spec).unwrapped.reward == env.unwrapped.reward
 
 
-def test_time_limit_is_100_steps_and_nothing_terminates(env):
+def test_time_limit_ends_the_episode_and_nothing_terminates(env):
     env.reset(seed=0)
-    ends = [(terminated, truncated) for _, _, terminated, truncated, _ in roll(env, actions(env, 100))]
-    assert ends == [(False, False)] * 99 + [(False, True)]
+    limit = 300 if "PickAndPlace" in env.spec.id else 100
+    ends = [(terminated, truncated) for _, _, terminated, truncated, _ in roll(env, actions(env, limit))]
+    assert ends == [(False, False)] * (limit - 1) + [(False, True)]
 
 
 def test_reset_forgets_the_past_bitwise(env):
@@ -141,7 +144,9 @@ def test_observations_stay_in_their_finite_space(env):
     space = env.observation_space
     for box in space.values():
         assert np.isfinite(box.low).all() and np.isfinite(box.high).all() and box.dtype == np.float32
-    for policy in (lambda k: np.ones(3), lambda k: -np.ones(3), lambda k: np.where(np.arange(3) == k // 34, 1, -1)):
+    size = env.action_space.shape[0]
+    one_at_a_time = lambda k: np.where(np.arange(size) == k * size // 100, 1, -1)  # noqa: E731
+    for policy in (lambda k: np.ones(size), lambda k: -np.ones(size), one_at_a_time):
         observation, _ = env.reset(seed=2)
         for k in range(100):
             assert observation in space
@@ -160,7 +165,8 @@ def test_rewards_are_those_of_compute_reward_for_one_goal_and_for_batches(env):
         desired.append(observation["desired_goal"])
     batch = env.unwrapped.compute_reward(np.array(achieved), np.array(desired), None)
     np.testing.assert_array_equal(batch, np.float32(rewards))
-    grid = env.unwrapped.compute_reward(np.array(achieved).reshape(8, 5, 3), np.array(desired).reshape(8, 5, 3), [{}])
+    shape = (8, 5, len(achieved[0]))
+    grid = env.unwrapped.compute_reward(np.array(achieved).reshape(shape), np.array(desired).reshape(shape), [{}])
     np.testing.assert_array_equal(grid, np.float32(rewards).reshape(8, 5))
 
 
@@ -179,17 +185,22 @@ def test_dense_reward_is_minus_the_distance_in_centimetres():
 def test_info_says_the_same_as_the_observation(env):
     observation, info = env.reset(seed=0)
     keys = {"is_success", "distance_mm", "energy_J", "cost", "solver"}
-    for action in [None, *actions(env, 20), *np.ones((30, 3), np.float32)]:
+    keys |= {"yaw_error_deg"} if "TwistAlign" in env.spec.id else set()
+    muscles = env.unwrapped.core.record.temperature.shape[1]
+    for action in [None, *actions(env, 20), *np.ones((30, *env.action_space.shape), np.float32)]:
         if action is not None:
             observation, _, _, _, info = env.step(action)
         assert set(info) == keys
         assert set(info["solver"]) == {"converged", "residual", "iterations"}
-        distance = np.linalg.norm(observation["achieved_goal"].astype(float) - observation["desired_goal"])
+        distance = np.linalg.norm(observation["achieved_goal"][:3].astype(float) - observation["desired_goal"][:3])
         assert info["distance_mm"] == pytest.approx(10.0 * distance, abs=1e-9)
-        assert info["is_success"] is bool(distance <= 0.1)
+        reward = gym.make(f"{env.spec.id.removesuffix('-v0').removesuffix('Dense')}-v0").unwrapped.compute_reward(
+            observation["achieved_goal"], observation["desired_goal"], info
+        )
+        assert info["is_success"] is (reward == 0.0)
         assert info["solver"]["converged"] is True
-        assert info["solver"]["residual"] < 1e-6
-    temperature = 25.0 + 125.0 * observation["observation"][:3].astype(float)
+        assert info["solver"]["residual"] < env.unwrapped.core.arm.tolerance
+    temperature = 25.0 + 125.0 * observation["observation"][:muscles].astype(float)
     assert info["cost"] == pytest.approx(np.maximum(temperature - SOFT_LIMIT, 0.0).sum(), abs=1e-3)
     assert info["cost"] > 0.0
 
@@ -197,22 +208,26 @@ def test_info_says_the_same_as_the_observation(env):
 def test_energy_is_power_times_time_from_the_start_of_the_episode(env):
     _, info = env.reset(seed=0)
     assert info["energy_J"] == 0.0
-    *_, info = roll(env, np.zeros((5, 3), np.float32))[-1]
-    assert info["energy_J"] == pytest.approx(5 * 0.1 * 3 * 1.0)  # half of 2 W in three TCAs
+    full = env.unwrapped.core.heating.max_power
+    np.testing.assert_allclose(full[:3], 2.0)
+    *_, info = roll(env, np.zeros((5, *env.action_space.shape), np.float32))[-1]
+    assert info["energy_J"] == pytest.approx(5 * 0.1 * 0.5 * full.sum())
     _, info = env.reset(seed=0)
     assert info["energy_J"] == 0.0
 
 
 def test_the_cut_off_keeps_every_tca_below_the_hard_limit(env):
     env.reset(seed=0)
-    roll(env, np.ones((100, 3), np.float32))
+    roll(env, np.ones((100, *env.action_space.shape), np.float32))
     temperature = env.unwrapped.core.record.temperature
     np.testing.assert_allclose(temperature, core.CUT_OFF, rtol=1e-12)
     assert temperature.max() < HARD_LIMIT
 
 
-@pytest.mark.parametrize("bad", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0], [[0, 0, 0]], 0.0, "abc", [[0], 0, 0], object()])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, [0, 0], [[0, 0, 0]], 0.0, "abc", [[0], 0, 0], object()], ids=str)
 def test_bad_actions_are_refused_and_leave_the_episode_as_it_was(env, bad):
+    if isinstance(bad, float) and not np.isfinite(bad):
+        bad = [*[0.0] * (env.action_space.shape[0] - 1), bad]
     env.reset(seed=3)
     roll(env, actions(env, 5))
     unwrapped, twin = env.unwrapped, copy.deepcopy(env.unwrapped)
@@ -224,8 +239,9 @@ def test_bad_actions_are_refused_and_leave_the_episode_as_it_was(env, bad):
 def test_finite_actions_outside_the_box_are_clipped(env):
     env.reset(seed=3)
     twin = copy.deepcopy(env.unwrapped)
-    wild = np.array([5.0, -1e30, 0.3], dtype=np.float32)
-    assert_same([env.unwrapped.step(wild)], [twin.step(np.array([1.0, -1.0, 0.3], dtype=np.float32))])
+    rest = [0.3] * (env.action_space.shape[0] - 3)
+    wild, tame = np.array([5.0, -1e30, *rest, 7.0], np.float32), np.array([1.0, -1.0, *rest, 1.0], np.float32)
+    assert_same([env.unwrapped.step(wild)], [twin.step(tame)])
 
 
 def test_a_failed_solve_keeps_the_last_good_state_and_truncates(env, monkeypatch):
@@ -239,7 +255,7 @@ def test_a_failed_solve_keeps_the_last_good_state_and_truncates(env, monkeypatch
         rest[-1][:] = (collocation.FAILED, 1.0, 7)
 
     monkeypatch.setattr(core, "solve_lanes", without_answer)
-    after, reward, terminated, truncated, info = unwrapped.step(np.ones(3, np.float32))
+    after, reward, terminated, truncated, info = unwrapped.step(np.ones(env.action_space.shape, np.float32))
     assert (terminated, truncated) == (False, True)
     assert info["solver"] == {"converged": False, "residual": 1.0, "iterations": 7}
     assert np.isfinite(reward)
@@ -264,27 +280,36 @@ def test_metadata_belongs_to_the_instance():
 
 
 @pytest.mark.parametrize("action", ["random", "bang-bang"])
-def test_long_rough_rides_never_fail(action):
-    env = gym.make("TCAReach-v0")
+@pytest.mark.parametrize("name", ["TCAReach-v0", "TCATwistAlign-v0", "TCAPickAndPlace-v0"])
+def test_long_rough_rides_never_fail(name, action):
+    env = gym.make(name)
     rng = np.random.default_rng(0)
+    shape = env.action_space.shape
     for seed in range(10):
         env.reset(seed=seed)
         for _ in range(100):
-            powers = rng.uniform(-1, 1, 3) if action == "random" else rng.choice([-1.0, 1.0], 3)
-            observation, reward, _, _, info = env.step(powers.astype(np.float32))
+            command = rng.uniform(-1, 1, shape) if action == "random" else rng.choice([-1.0, 1.0], shape)
+            observation, reward, _, _, info = env.step(command.astype(np.float32))
             assert info["solver"]["converged"]
             assert np.isfinite(reward) and all(np.isfinite(x).all() for x in observation.values())
 
 
-def test_every_lane_of_a_batch_equals_the_single_environment_bitwise():
-    task = gym.make("TCAReach-v0").unwrapped.task
+@pytest.mark.parametrize("name", ["TCAReach-v0", "TCATwistAlign-v0", "TCAPickAndPlace-v0"])
+def test_every_lane_of_a_batch_equals_the_single_environment_bitwise(name):
+    env = gym.make(name).unwrapped
+    task = env.task
     many, rng = task.core(7), np.random.default_rng(0)
     singles = [task.core(1) for _ in range(7)]
+    goals, scenes = task.draw(many, rng, 7)
+    many.reset(np.arange(7), goals, scenes)
+    for i, single in enumerate(singles):
+        single.reset(np.array([0]), goals[i : i + 1], scenes[i : i + 1])
     for _ in range(20):
-        powers = rng.uniform(-1, 1, (7, 3))
-        report = many.step(powers)
+        command = rng.uniform(-1, 1, (7, task.actions))
+        report = task.step(many, command)
         for i, single in enumerate(singles):
-            alone = single.step(powers[i : i + 1])
+            alone = task.step(single, command[i : i + 1])
             assert alone.tobytes() == report[i : i + 1].tobytes()
             assert task.observe(single).tobytes() == task.observe(many)[i : i + 1].tobytes()
+            assert task.achieved(single.record).tobytes() == task.achieved(many.record)[i : i + 1].tobytes()
             assert single.record.strain.tobytes() == many.record.strain[i : i + 1].tobytes()

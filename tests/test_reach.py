@@ -8,7 +8,8 @@ import tca_envs  # noqa: F401
 from tca_envs.mechanics import thermal
 from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT
 from tca_envs.tasks.core import STEP_S
-from tca_envs.tasks.reach import Reach, held_out
+from tca_envs.tasks.reach import Reach
+from tca_envs.tasks.task import held_out
 
 
 def test_a_goal_is_the_tip_that_steady_powers_reach():
@@ -19,7 +20,7 @@ def test_a_goal_is_the_tip_that_steady_powers_reach():
         temperature = rng.uniform(AMBIENT, SOFT_LIMIT, 3)
         settled, good = core.settle(temperature[np.newaxis])
         assert good.all()
-        core.reset(np.array([0]), np.zeros((1, 3)))
+        core.reset(np.array([0]), np.zeros((1, 3)), np.zeros((1, 0)))
         action = 2.0 * thermal.steady_power(temperature, core.heating) / core.heating.max_power - 1.0
         for _ in range(int(40.0 / STEP_S)):
             core.step(action[np.newaxis])
@@ -44,7 +45,7 @@ def test_goals_come_from_their_split(split, monkeypatch):
         return settle(temperature)
 
     monkeypatch.setattr(core, "settle", remember)
-    task.draw_goals(core, np.random.default_rng(0), 30)
+    task.draw(core, np.random.default_rng(0), 30)
     assert len(drawn) == 30
     assert all(held_out(temperature) == (split == "held-out") for temperature in drawn)
 

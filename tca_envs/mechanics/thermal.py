@@ -34,6 +34,10 @@ class Heating(NamedTuple):
     ambient: float = AMBIENT
     """T_amb [degC]."""
 
+    def part(self, muscles: slice) -> "Heating":
+        """Return the constants of some of the muscles."""
+        return Heating(self.capacity[muscles], self.loss[muscles], self.max_power[muscles], self.ambient)
+
 
 @dataclass(frozen=True)
 class Heater:

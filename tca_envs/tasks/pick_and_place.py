@@ -36,14 +36,16 @@ class PickAndPlace(Task):
     only), a fifth one opens the gripper's ring, and a stage moves the base up and down. An upright board (3 mm wide, 12 mm
     long, 8 mm high, 1.5 g) stands on a table, its centre 10 mm under the jaws of the cold arm.
 
-    Grasping follows from physics. The jaws go down over the object only where their gap is wider than the object as it lies to them;
-    otherwise the stage stops on its top. Closing jaws push the object to their middle and turn it into line. It is held as long
-    as friction carries its weight, 2 mu N >= m g, with the pinch force N of the cooling ring; its weight then loads the arm.
+    Grasping follows from physics. The jaws go down over the object only where their gap is wider than the object as it lies
+    to them; otherwise the stage stops on its top. Closing jaws push the object to their middle and turn it into line. It is
+    held as long as friction carries its weight, 2 mu N >= m g, with the pinch force N of the cooling ring; its weight then
+    loads the arm.
     When the jaws open it falls straight down and stays where it lands.
 
     The arm is quasi-static: it is in equilibrium at every step, while the temperatures follow the heating powers with a time
-    constant of 1.8 s. Not modelled: contact between arm and table beyond a stop of the stage, sides of the jaws that push an
-    object which is not between them, impact, tilting and rolling of the object, the jaws' tilt in contacts, the 1 mm by which the ring's height changes.
+    constant of 1.8 s. Not modelled: contact between arm and table beyond a stop of the stage, jaws that push an object which
+    is not between them, impact, tilting and rolling of the object, the tilt of the jaws in contacts, the millimetre by which
+    the open ring is higher.
 
     ## Action Space
 
@@ -91,10 +93,10 @@ class PickAndPlace(Task):
     ## Starting State
 
     All TCAs at 25 degC, the arm hanging straight, the stage up. The object lies under the tool of a steady state, with its
-    yaw: at bending temperatures drawn uniformly between 25 and 100 degC and a twisting temperature between 25 and 125 degC (yaws
-    down to about -150 degrees). The target lies under an object carried by an untwisted arm at bending temperatures
-    between 25 and 120 degC, at least 6 mm away. Temperature space (of the seven temperatures) is dealt out in cells of
-    25 K: a fifth of them is held out for evaluation, and training episodes never come from those.
+    yaw: at bending temperatures drawn uniformly between 25 and 100 degC and a twisting temperature between 25 and 125 degC
+    (yaws down to about -150 degrees). The target lies under an object carried by an untwisted arm at bending
+    temperatures between 25 and 120 degC, at least 6 mm away. Temperature space (of the seven temperatures) is dealt out in
+    cells of 25 K: a fifth of them is held out for evaluation, and training episodes never come from those.
 
     ## Episode End
 
@@ -114,9 +116,7 @@ class PickAndPlace(Task):
     """
 
     actions = 6
-    goal_space = spaces.Box(
-        np.array([-BOX_CM] * 3 + [0.0], dtype=np.float32), np.array([BOX_CM] * 3 + [1.0], dtype=np.float32)
-    )
+    goal_space = spaces.Box(np.array([-BOX_CM] * 3 + [0.0], dtype=np.float32), np.array([BOX_CM] * 3 + [1.0], dtype=np.float32))
     observation_space = box_with_heat(
         5,
         [-BOX_CM] * 3 + [-1.0] * 2 + [0.0] * 3 + [-BOX_CM] * 3 + [-1.0] * 2,

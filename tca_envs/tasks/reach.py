@@ -129,4 +129,3 @@ class Reach(Task):
     def measures(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mapping[str, Array]:
         """Return what `info` reports of goals, by key."""
         return {"distance_mm": 10.0 * self.distance(achieved, desired)}
-

@@ -27,8 +27,9 @@ class TwistAlign(Task):
 
     The bending module and, under it, the twisting module of the paper's arm hang from their base; the gripper hangs from the
     end as dead weight. Three straight twisted-and-coiled actuators (TCAs) bend the first module, a helical one turns the
-    second: when heated, it turns the gripper one way only, counter-clockwise as seen from above. The arm is quasi-static: it is in equilibrium at every step, while the temperatures follow the heating powers
-    with a time constant of 1.8 s.
+    second: when heated, it turns the gripper one way only, counter-clockwise as seen from above. The arm is
+    quasi-static: it is in equilibrium at every step, while the temperatures follow the heating powers with a time constant
+    of 1.8 s.
 
     ## Action Space
 
