@@ -185,13 +185,13 @@ class PickAndPlaceController:
 
 OPEN = 147.0
 """Temperature of the open gripper [degC]."""
-ALIGNED, ALIGNED_YAW = 5e-4, np.radians(4.0)
+ALIGNED, ALIGNED_YAW = 1e-3, np.radians(8.0)
 """Errors of the tool [m], [rad] at which the gripper opens and goes down."""
 MARGIN = 4e-4
 """Spare gap of the jaws [m]."""
 GRASP_DEPTH = 1.5e-3
 """The jaws close when they are no higher above the object's centre [m]."""
-OVER_TARGET, PLACED = 1e-3, 2.5e-3
+OVER_TARGET, PLACED = 1.5e-3, 2.8e-3
 """Errors of the object [m] at which it is released, and at which it is left."""
 UNTWISTED = np.radians(15.0)
 """Yaw of the tool [rad] that counts as the original one."""

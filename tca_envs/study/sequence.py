@@ -1,0 +1,286 @@
+"""The paper's Fig. 6: the arm picks an object up and puts it down, as a sequence of equilibria.
+
+Source: Sun & Zhao, section IV.B. The steps are the paper's: (a) straight, the object 10 mm under the gripper; (b) the twisting
+module aligns the gripper; (c) the gripper opens; (d) the arm is lowered and the gripper closes; (e) the arm lifts the object;
+(f) the twisting module cools; (g) the bending module bends to +x and the gripper opens again. Whether the object comes along
+follows from gap, pinch force and friction (`tca_envs.mechanics.grasp`).
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import pi
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from tca_envs import presets
+from tca_envs.mechanics import TCA, Arm, Equilibrium, Gripper, Payload, grasp
+from tca_envs.study import output
+
+if TYPE_CHECKING:
+    from mpl_toolkits.mplot3d import Axes3D
+
+Array = NDArray[np.float64]
+
+COLD, OPEN, BENT = 25.0, 147.0, 110.0
+"""Temperatures [degC] of cold TCAs, of the open gripper and of the TCA at +x in (g)."""
+HOTTEST = 150.0
+"""[degC]."""
+OBJECT_YAW = -60.0
+"""Of the object [deg]."""
+LOWERED = 10e-3
+"""[m] (paper, Fig. 6: the object is 10 mm under the gripper)."""
+SUBSTEPS = 20
+"""Of a change of temperatures or of the stage."""
+PANELS = ("start", "twist", "open", "lower, close", "lift", "untwist", "bend, open")
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A panel of Fig. 6."""
+
+    label: str
+    temperature: Array
+    """(5,) [degC]: bending TCAs, helical TCA, gripper's TCA."""
+    scene: Array
+    """(SCENE,) as of `grasp`."""
+    arm: Equilibrium
+    gap: float
+    """Of the jaws [m]; with the object between them at least its width."""
+    pinch: float
+    """Force on the object [N]."""
+
+    @property
+    def yaw(self) -> float:
+        """Of the gripper [deg]."""
+        r = self.arm.tip_pose
+        return float(np.degrees(np.arctan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1])))
+
+
+class Rig:
+    """The arm, its gripper and the object, moved step by step.
+
+    Parameters
+    ----------
+    law : TCA
+        Parameter set of all TCAs.
+    """
+
+    def __init__(self, law: TCA) -> None:
+        self.law = law
+        self.gripper = presets.gripper(law)
+        self.temperature = np.full(5, COLD)
+        self.scene = np.zeros((1, grasp.SCENE))
+        self.scene[0, grasp.Z] = grasp.resting(presets.OBJECT, presets.SITE)
+        self.scene[0, grasp.YAW] = np.radians(OBJECT_YAW)
+        self.arms: dict[Payload | None, Arm] = {}
+        self.arm = self._arm(None).equilibrium(self.temperature[:4])
+
+    def _arm(self, payload: Payload | None) -> Arm:
+        if payload not in self.arms:
+            self.arms[payload] = presets.whole_arm(self.law, payload)
+        return self.arms[payload]
+
+    def move(self, temperature: Array, lowered: float = 0.0) -> None:
+        """Go to temperatures (5,) [degC] and then move the stage by `lowered` [m], in substeps."""
+        change = (temperature - self.temperature) / SUBSTEPS
+        for step in range(2 * SUBSTEPS):
+            heating = step < SUBSTEPS
+            self.temperature = self.temperature + change if heating else self.temperature
+            held = self.scene[0, grasp.HELD] > 0.5
+            payload = presets.with_object(self.scene[0, grasp.ALONG], self.scene[0, grasp.DROP]) if held else None
+            arm = self._arm(payload).equilibrium(self.temperature[:4], start=self.arm)
+            if not arm.converged:
+                raise RuntimeError(f"the arm has no equilibrium at {self.temperature[:4].round(1).tolist()} degC")
+            self.arm = arm
+            tool, heading = place(arm)
+            self.scene = grasp.step(
+                self.scene, tool[np.newaxis], np.array([heading]), self.gripper.gap(self.temperature[4:]),
+                self.gripper.pinch(self.temperature[4:], presets.OBJECT.width),
+                np.array([0.0 if heating else lowered / SUBSTEPS]), presets.OBJECT, presets.SITE,
+            )  # fmt: skip
+        self.temperature = temperature.astype(np.float64)
+
+    def frame(self, label: str) -> Frame:
+        """Return what there is now."""
+        between = bool(self.scene[0, grasp.HELD] > 0.5 or self.scene[0, grasp.ASTRIDE] > 0.5)
+        gap = float(self.gripper.gap(self.temperature[4]))
+        pinch = float(self.gripper.pinch(self.temperature[4], presets.OBJECT.width)) if between else 0.0
+        opening = max(gap, presets.OBJECT.width) if between else gap
+        return Frame(label, self.temperature.copy(), self.scene[0].copy(), self.arm, opening, pinch)
+
+
+def place(arm: Equilibrium) -> tuple[Array, float]:
+    """Return the point between the jaws (3,) [m], with the stage up, and the direction in which they open [rad]."""
+    r = arm.tip_pose
+    return r[:3, 3] + presets.JAW_DEPTH * r[:3, 2], float(np.arctan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1]))
+
+
+def turns(law: TCA, temperature: Array) -> Array:
+    """Return the gripper's yaw [deg], counted on beyond -180, at temperatures (k,) [degC] of the helical TCA alone."""
+    arm, here, yaws = presets.whole_arm(law), None, []
+    for value in temperature:
+        here = arm.equilibrium([COLD, COLD, COLD, value], start=here)
+        yaws.append(place(here)[1])
+    return np.degrees(np.unwrap(yaws))
+
+
+def figure6(law: TCA) -> list[Frame]:
+    """Compute the frames of Fig. 6; where the helix cannot turn as far as the object lies, it turns as far as it can."""
+    rig = Rig(law)
+    grid = np.linspace(COLD, HOTTEST, 26)
+    twisted = float(np.interp(-OBJECT_YAW, np.maximum.accumulate(-turns(law, grid)), grid))
+    steps = (
+        ((COLD, COLD, COLD, COLD, COLD), 0.0),
+        ((COLD, COLD, COLD, twisted, COLD), 0.0),
+        ((COLD, COLD, COLD, twisted, OPEN), 0.0),
+        ((COLD, COLD, COLD, twisted, OPEN), LOWERED),
+        ((COLD, COLD, COLD, twisted, COLD), -LOWERED),
+        ((COLD, COLD, COLD, COLD, COLD), 0.0),
+        ((BENT, COLD, COLD, COLD, COLD), 0.0),
+    )
+    frames = []
+    for label, (temperature, lowered) in zip(PANELS, steps, strict=True):
+        if label == "lift":  # the gripper closes first, and is shown so
+            rig.move(np.array(temperature))
+            frames[-1] = rig.frame(PANELS[3])
+        rig.move(np.array(temperature), lowered)
+        if label == PANELS[-1]:
+            rig.move(np.array([*temperature[:4], OPEN]))
+        frames.append(rig.frame(label))
+    return frames
+
+
+def write6(sequences: dict[str, list[Frame]], path: Path) -> None:
+    """Write Fig. 6 as CSV."""
+    header = [
+        "case", "panel", *(f"temperature_{i}_degC" for i in range(5)), "stage_mm", "tip_x_mm", "tip_y_mm", "tip_z_mm", "yaw_deg",
+        "gap_mm", "pinch_mN", "object_x_mm", "object_y_mm", "object_z_mm", "object_yaw_deg", "held",
+    ]  # fmt: skip
+    rows = [
+        (
+            case, f.label, *map(float, f.temperature), 1e3 * float(f.scene[grasp.STAGE]),
+            *(1e3 * float(x) for x in f.arm.tip_pose[:3, 3]), f.yaw, 1e3 * f.gap, 1e3 * f.pinch,
+            *(1e3 * float(x) for x in f.scene[grasp.X : grasp.Z + 1]), float(np.degrees(f.scene[grasp.YAW])),
+            int(f.scene[grasp.HELD]),
+        )
+        for case, frames in sequences.items() for f in frames
+    ]  # fmt: skip
+    output.write_csv(path, header, rows)
+
+
+def ring(gripper: Gripper, gap: float, side: float, points: int = 30) -> Array:
+    """Return one half of the ring (points, 2) [m], across and below its mount, as an arc that ends at the jaw."""
+    half = 0.5 * gripper.length
+    angle = brentq(lambda x: 2.0 * half * np.sin(x) / x - gap, 0.5 * pi, pi) if gap > 0.0 else pi
+    s = np.linspace(0.0, 1.0, points)
+    return half / angle * np.column_stack([side * np.sin(s * angle), 1.0 - np.cos(s * angle)])
+
+
+def draw6(sequences: dict[str, list[Frame]], path: Path) -> None:
+    """Draw Fig. 6 into a PNG file: a row for each case, a panel for each step."""
+    output.require_matplotlib()
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    columns = len(PANELS)
+    figure = Figure(figsize=(1.8 * columns, 4.3 * len(sequences) + 0.3))
+    for row, (case, frames) in enumerate(sequences.items()):
+        for column, frame in enumerate(frames):
+            options: dict[str, Any] = {"projection": "3d", "computed_zorder": False}
+            axes = figure.add_subplot(len(sequences), columns, row * columns + column + 1, **options)
+            draw_frame(axes, frame)
+            place_of_object = "held" if frame.scene[grasp.HELD] > 0.5 else "on the table"
+            axes.set_title(
+                f"({'abcdefg'[column]}) {frame.label}\nyaw {round(frame.yaw)}°, gap {1e3 * frame.gap:.1f} mm\n"
+                f"object {place_of_object}",
+                fontsize=9,
+            )  # fmt: skip
+        figure.text(0.006, 0.97 - (row + 0.5) * 0.93 / len(sequences), case, rotation=90, va="center", fontsize=11)
+    handles = [
+        Line2D([], [], color="black", lw=3, label="centerline and gripper"),
+        Line2D([], [], color="#D62728", lw=2, label="hot TCA"),
+        Line2D([], [], color="#2CA02C", lw=2, label="cold TCA"),
+        Line2D([], [], color="#1F77B4", lw=1.2, label="cross sections"),
+        Line2D([], [], color="#E69F00", lw=5, label="object"),
+    ]
+    figure.subplots_adjust(left=0.03, right=1.0, bottom=0.05, top=0.93, wspace=0.0, hspace=0.22)
+    figure.legend(handles=handles, loc="lower center", ncols=5, frameon=False, fontsize=9)
+    output.save_figure(figure, path)
+
+
+def draw_frame(axes: "Axes3D", frame: Frame) -> None:
+    """Draw one panel, lengths in mm."""
+    arm = presets.whole_arm()  # routes and lengths are those of every set
+    base = np.array([0.0, 0.0, float(frame.scene[grasp.STAGE])])
+    start = 0.0
+    index = 0
+    for module in arm.modules:
+        s = np.linspace(0.0, module.length, 160 if index else 30)
+        poses = frame.arm.poses(start + s)
+        centre = poses[:, :3, 3] + base
+        axes.plot(*(1e3 * centre.T), color="black", lw=3, zorder=3)
+        for muscle in module.muscles:
+            routes = np.array([module.route(muscle, x / module.length) for x in s])
+            path = centre + np.einsum("kij,kj->ki", poses[:, :3, :2], routes[:, :2])
+            hot = frame.temperature[index] > COLD + 5.0
+            axes.plot(*(1e3 * path.T), color="#D62728" if hot else "#2CA02C", lw=1.6 if muscle.turns == 0 else 1.1, zorder=4)
+            index += 1
+        if module is arm.modules[0]:
+            angle = np.linspace(0.0, 2.0 * pi, 33)
+            circle = presets.BENDING_OFFSET * np.column_stack([np.cos(angle), np.sin(angle)])
+            for pose in poses[::6]:
+                loop = pose[:3, 3] + base + circle @ pose[:3, :2].T
+                axes.plot(*(1e3 * loop.T), color="#1F77B4", lw=0.9, zorder=2)
+        start += module.length
+    tip = frame.arm.tip_pose
+    gripper = presets.gripper()
+    for side in (-1.0, 1.0):
+        arc = ring(gripper, frame.gap, side)
+        points = tip[:3, 3] + base + arc @ tip[:3, [0, 2]].T
+        axes.plot(*(1e3 * points.T), color="black", lw=3, zorder=5, solid_capstyle="butt")
+    draw_box(axes, frame.scene)
+    table = 1e3 * presets.SITE.table
+    x, y = np.meshgrid([-14.0, 24.0], [-14.0, 14.0])
+    axes.plot_surface(x, y, np.full_like(x, table), color="0.75", alpha=0.5, zorder=0)
+    axes.set(xlim=(-14, 24), ylim=(-14, 14), zlim=(table + 3.0, -3.0))
+    axes.set_box_aspect((38, 28, table + 6.0), zoom=1.6)
+    axes.view_init(elev=14, azim=-72)
+    axes.set_axis_off()
+
+
+def draw_box(axes: "Axes3D", scene: Array) -> None:
+    """Draw the object."""
+    box, yaw = presets.OBJECT, scene[grasp.YAW]
+    across, along = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    corners = [0.5 * (a * box.width * across + b * box.length * along) for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))]
+    outline = 1e3 * (scene[grasp.X : grasp.Z] + np.array(corners))
+    low, high = (1e3 * (scene[grasp.Z] + sign * 0.5 * box.height) for sign in (1.0, -1.0))
+    x, y = np.tile(outline[:, 0], (2, 1)), np.tile(outline[:, 1], (2, 1))
+    axes.plot_surface(x, y, np.repeat([[low], [high]], 5, axis=1), color="#E69F00", alpha=0.9, zorder=4, linewidth=0)
+
+
+def agreement(sequences: dict[str, list[Frame]], laws: Iterable[TCA]) -> list[tuple[str, str, str, bool]]:
+    """Return what Fig. 6 shows, case, what the model says and whether it holds."""
+    rows = []
+    for (case, frames), law in zip(sequences.items(), laws, strict=True):
+        yaws = turns(law, np.linspace(40.0, HOTTEST, 23))
+        one_way = bool((np.diff(yaws) < 0.0).all())
+        found = f"from 40 to {HOTTEST:g} °C by {yaws[-1] - yaws[0]:.0f}°"
+        rows.append(("Fig. 6: the twisting module turns the gripper, one way only", case, found, one_way))
+        aligned = frames[1]
+        found = f"yaw {aligned.yaw:.0f}° for an object at {OBJECT_YAW:.0f}°"
+        rows.append(("Fig. 6b: it aligns the gripper", case, found, abs(aligned.yaw - OBJECT_YAW) < 5.0))
+        gap = 1e3 * frames[2].gap
+        found = f"gap {gap:.1f} mm for {1e3 * presets.OBJECT.width:g} mm"
+        rows.append(("Fig. 6c: the gripper opens wider than the object", case, found, gap > 1e3 * presets.OBJECT.width))
+        lifted, moved = frames[5].scene, frames[6].scene
+        found = f"pinched with {1e3 * frames[4].pinch:.0f} mN, lifted" if lifted[grasp.HELD] else "not held"
+        rows.append(("Fig. 6d-f: it pinches and lifts the object", case, found, bool(lifted[grasp.HELD])))
+        found = f"put down at x = {1e3 * moved[grasp.X]:.1f} mm"
+        placed = bool(moved[grasp.X] > 3e-3 and not moved[grasp.HELD])
+        rows.append(("Fig. 6g: it puts the object down elsewhere, at +x", case, found, placed))
+    return rows
