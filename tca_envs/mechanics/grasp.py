@@ -14,10 +14,11 @@ from tca_envs.mechanics import check
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-STAGE, X, Y, Z, YAW, HELD, ASTRIDE, ALONG, DROP = range(9)
+STAGE, X, Y, Z, YAW, HELD, ASTRIDE, ALONG, DROP, LOW = range(10)
 """Columns of a scene: how far the stage is lowered [m]; the box's centre [m] and yaw [rad]; whether the jaws hold it,
-whether it stands between them (0 or 1); of a held box, its place along the jaws' width and below the jaws [m]."""
-SCENE = 9
+whether it stands between them (0 or 1); of a held box, its place along the jaws' width and below the jaws [m]; whether the
+jaws are lower than the top of a box on the table (0 or 1)."""
+SCENE = 10
 
 
 @dataclass(frozen=True)
@@ -139,16 +140,17 @@ def step(scene: Array, tool: Array, heading: Array, gap: Array, pinch: Array, lo
     reach, extent = half_extents(turn, box)
 
     # The stage and its stops.
-    above = ~held & (tool[:, 2] + scene[:, STAGE] <= top)
+    above = ~held & (scene[:, LOW] < 0.5)
     under = above & (np.abs(along) < 0.5 * site.jaw_width + extent)
     under &= np.abs(across) < 0.5 * gap + site.jaw_thickness + reach
     fits = np.abs(across) + reach <= 0.5 * gap
     stop = site.table - tool[:, 2]
     stop = np.where(held, np.minimum(stop, rest - scene[:, DROP] - tool[:, 2]), stop)
-    stop = np.where(under & ~fits, np.minimum(stop, top - tool[:, 2]), stop)
+    blocked = under & ~fits
+    stop = np.where(blocked, np.minimum(stop, top - tool[:, 2]), stop)
     stage = np.clip(scene[:, STAGE] + lowering, 0.0, np.clip(stop, 0.0, site.travel))
     jaws = tool[:, 2] + stage
-    low = jaws > top
+    low = (jaws > top) & ~blocked
 
     # A box on the table between the jaws.
     astride = ~held & low & ((scene[:, ASTRIDE] > 0.5) | (under & fits)) & (np.abs(along) <= 0.5 * site.jaw_width)
@@ -172,5 +174,6 @@ def step(scene: Array, tool: Array, heading: Array, gap: Array, pinch: Array, lo
     after[:, HELD] = kept | caught
     after[:, ASTRIDE] = (astride & ~caught) | (held & ~kept & low)
     after[:, ALONG] = np.where(kept | caught, along, 0.0)
+    after[:, LOW] = low
     after[:, DROP] = np.where(kept, scene[:, DROP], np.where(caught, rest - jaws, 0.0))
     return after

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from math import pi
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from tca_envs.mechanics import TCA, Arm, Equilibrium, Gripper, Payload, grasp
 from tca_envs.study import output
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
 Array = NDArray[np.float64]
@@ -186,20 +187,23 @@ def draw6(sequences: dict[str, list[Frame]], path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    columns = len(PANELS)
-    figure = Figure(figsize=(1.8 * columns, 4.3 * len(sequences) + 0.3))
+    columns, rows, wide, high = len(PANELS), len(sequences), 1.75, 4.1  # panels [inch]
+    figure = Figure(figsize=(wide * columns + 0.3, high * rows + 0.35))
     for row, (case, frames) in enumerate(sequences.items()):
+        bottom = 0.35 + high * (rows - 1 - row)
         for column, frame in enumerate(frames):
-            options: dict[str, Any] = {"projection": "3d", "computed_zorder": False}
-            axes = figure.add_subplot(len(sequences), columns, row * columns + column + 1, **options)
-            draw_frame(axes, frame)
-            place_of_object = "held" if frame.scene[grasp.HELD] > 0.5 else "on the table"
-            axes.set_title(
-                f"({'abcdefg'[column]}) {frame.label}\nyaw {round(frame.yaw)}°, gap {1e3 * frame.gap:.1f} mm\n"
-                f"object {place_of_object}",
-                fontsize=9,
+            middle = 0.3 + wide * (column + 0.5)
+            # A 3D view is a square, so neighbours overlap.
+            rectangle = (middle - 0.5 * high, bottom - 0.3, high, high)
+            axes = figure.add_axes(inches(figure, rectangle), projection="3d", computed_zorder=False)
+            draw_frame(cast("Axes3D", axes), frame)
+            holding = "held" if frame.scene[grasp.HELD] > 0.5 else "on the table"
+            figure.text(
+                *inches(figure, (middle, bottom + high - 0.08)),
+                f"({'abcdefg'[column]}) {frame.label}\nyaw {round(frame.yaw)}°, gap {1e3 * frame.gap:.1f} mm\nobject {holding}",
+                fontsize=9, ha="center", va="top",
             )  # fmt: skip
-        figure.text(0.006, 0.97 - (row + 0.5) * 0.93 / len(sequences), case, rotation=90, va="center", fontsize=11)
+        figure.text(*inches(figure, (0.1, bottom + 0.5 * high)), case, rotation=90, va="center", fontsize=11)
     handles = [
         Line2D([], [], color="black", lw=3, label="centerline and gripper"),
         Line2D([], [], color="#D62728", lw=2, label="hot TCA"),
@@ -207,9 +211,13 @@ def draw6(sequences: dict[str, list[Frame]], path: Path) -> None:
         Line2D([], [], color="#1F77B4", lw=1.2, label="cross sections"),
         Line2D([], [], color="#E69F00", lw=5, label="object"),
     ]
-    figure.subplots_adjust(left=0.03, right=1.0, bottom=0.05, top=0.93, wspace=0.0, hspace=0.22)
     figure.legend(handles=handles, loc="lower center", ncols=5, frameon=False, fontsize=9)
     output.save_figure(figure, path)
+
+
+def inches(figure: "Figure", lengths: tuple[float, ...]) -> Any:
+    """Return x, y, or x, y, width, height, as fractions of the figure from inches."""
+    return tuple(length / size for length, size in zip(lengths, 2 * list(figure.get_size_inches()), strict=False))
 
 
 def draw_frame(axes: "Axes3D", frame: Frame) -> None:
@@ -247,7 +255,8 @@ def draw_frame(axes: "Axes3D", frame: Frame) -> None:
     x, y = np.meshgrid([-14.0, 24.0], [-14.0, 14.0])
     axes.plot_surface(x, y, np.full_like(x, table), color="0.75", alpha=0.5, zorder=0)
     axes.set(xlim=(-14, 24), ylim=(-14, 14), zlim=(table + 3.0, -3.0))
-    axes.set_box_aspect((38, 28, table + 6.0), zoom=1.6)
+    axes.set_box_aspect((38, 28, table + 6.0), zoom=1.3)
+    axes.patch.set_alpha(0.0)
     axes.view_init(elev=14, azim=-72)
     axes.set_axis_off()
 
