@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.type_aliases import MaybeCallback
 
+from agents.features import PickAndPlaceFeatures
 from agents.scripted import CONTROLLERS
 
 Observations = dict[str, NDArray[np.float32]]
@@ -35,7 +36,8 @@ class DAgger(PPO):
     def __init__(self, policy: Any, env: Any, controller: str | None = None, **options: Any) -> None:
         self.controller = controller
         self.record: list[tuple[Observations, NDArray[np.float32]]] = []
-        options["policy_kwargs"] = {"activation_fn": torch.nn.ReLU, **(options.get("policy_kwargs") or {})}
+        made = {"activation_fn": torch.nn.ReLU, "features_extractor_class": PickAndPlaceFeatures}
+        options["policy_kwargs"] = {**made, **(options.get("policy_kwargs") or {})}
         super().__init__(policy, env, **options)
 
     def _excluded_save_params(self) -> list[str]:

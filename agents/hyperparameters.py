@@ -102,7 +102,7 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
             "policy_kwargs": {"net_arch": {"pi": [256, 256], "vf": [1]}},
             "learning_rate": decaying,
             "n_steps": 1_500,
-            "batch_size": 512,
+            "batch_size": 500,
             "n_epochs": 12,
         },
     },

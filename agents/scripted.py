@@ -99,7 +99,7 @@ class PickAndPlaceController:
 
     The state is read off the observation at every step, so that a slip or a missed grasp leads back to where it belongs:
 
-    1. `align`: bend and twist until the tool is over the object with its yaw;
+    1. `align`: bend and twist until the tool is over the object with its yaw; near it the gripper begins to open;
     2. `open`: heat the gripper until the object fits between the jaws;
     3. `lower`: until the jaws are around the object's middle;
     4. `close`: let the gripper cool until friction holds the object;
@@ -140,7 +140,8 @@ class PickAndPlaceController:
             bent = np.full(4, AMBIENT)
         else:
             bent = self._plan("object", np.append(scene.object[:2], scene.object_yaw))
-        wide_open = phase in ("open", "lower", "release") or (phase == "leave" and scene.low)
+        near = float(np.linalg.norm(scene.object[:2] - scene.tool[:2])) < NEAR and scene.turn < NEAR_YAW
+        wide_open = phase in ("open", "lower", "release") or (phase == "leave" and scene.low) or (phase == "align" and near)
         jaws = OPEN if wide_open else AMBIENT
         speed = {"lower": 1.0, "open": 0.0, "close": 0.0, "release": 0.0}.get(phase, -1.0)
         bending, opening = self.heating.part(slice(4)), self.heating.part(slice(4, 5))
@@ -157,7 +158,7 @@ class PickAndPlaceController:
             return "carry" if abs(scene.yaw) < UNTWISTED else "untwist"
         if np.linalg.norm(scene.object[:2] - scene.target) < PLACED:
             return "leave"
-        tool, turn = scene.tool, abs(float(grasp.half_turn(np.array(scene.object_yaw - scene.yaw))))
+        tool, turn = scene.tool, scene.turn
         beside = float(np.linalg.norm(scene.object[:2] - tool[:2]))
         if scene.between and tool[2] > scene.object[2] - GRASP_DEPTH:
             return "close"
@@ -187,6 +188,8 @@ OPEN = 147.0
 """Temperature of the open gripper [degC]."""
 ALIGNED, ALIGNED_YAW = 1e-3, np.radians(8.0)
 """Errors of the tool [m], [rad] at which the gripper opens and goes down."""
+NEAR, NEAR_YAW = 4e-3, np.radians(25.0)
+"""Errors of the tool [m], [rad] at which the gripper begins to open."""
 MARGIN = 4e-4
 """Spare gap of the jaws [m]."""
 GRASP_DEPTH = 1.5e-3
@@ -219,6 +222,11 @@ class Sight:
     object: Array
     object_yaw: float
     target: Array
+
+    @property
+    def turn(self) -> float:
+        """Angle between jaws and object [rad], at most 90 degrees."""
+        return abs(float(grasp.half_turn(np.array(self.object_yaw - self.yaw))))
 
     @classmethod
     def of(cls, observation: dict[str, NDArray[Any]]) -> "Sight":

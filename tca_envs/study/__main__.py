@@ -19,7 +19,7 @@ class Study(NamedTuple):
 
 
 STUDIES = {
-    "paper": Study(paper.run, "redraw the paper's Figs. 3, 4 and 5 and say where model and paper agree"),
+    "paper": Study(paper.run, "redraw the paper's Figs. 3 to 6 and say where model and paper agree"),
 }
 
 

@@ -1,4 +1,4 @@
-"""The paper's Figs. 3, 4 and 5 redrawn with the published points, and where model and paper agree.
+"""The paper's Figs. 3 to 6 redrawn with the published points, and where model and paper agree.
 
 Source: J. Sun and J. Zhao, "Modeling and Simulation of Soft Robots driven by Artificial Muscles: an Example using
 Twisted-and-Coiled Actuators" ("the paper"), section IV.A.
@@ -7,7 +7,7 @@ The scene of Figs. 4 and 5 is the paper's: the bending module alone, hanging und
 paper prints neither the module's weight nor all constants of its TCAs, so each figure is computed for several cases
 (`CASES`): the hardware set and the paper set of the TCA's constants with the module's estimated weight, and the paper set
 with the weight rho A L that eq. (9) gives for the effective section. What the weight and the rest of the arm change is a
-table of its own.
+table of its own. Fig. 6, which has no published points, is computed by `sequence`.
 
 Sweeps are warm-started. Where no equilibrium is found the curve has a gap (NaN) and `agreement.md` says where.
 """
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tca_envs import presets
 from tca_envs.mechanics import TCA, Arm, Equilibrium, Payload
-from tca_envs.study import output
+from tca_envs.study import output, sequence
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -641,24 +641,32 @@ def write_agreement(comparisons: Iterable[Comparison], path: Path) -> None:
 
 
 def run(out: Path, say: Callable[[str], object] = print) -> None:
-    """Write fig3, fig4, fig5 (.png, .csv) and agreement (.md, .csv) into the folder `out`, and print the agreement."""
+    """Write fig3 to fig6 (.png, .csv) and agreement (.md, .csv) into the folder `out`, and print the agreement."""
     elongations = [figure3(case) for case in (HARDWARE, PAPER)]
     bendings = [figure4(case) for case in CASES]
     stiffnesses = [figure5(case) for case in CASES]
+    laws = {case.name: case.law for case in (HARDWARE, PAPER)}
+    sequences = {name: sequence.figure6(law) for name, law in laws.items()}
     draw3(elongations, out / "fig3.png")
     draw4(bendings, out / "fig4.png")
     draw5(stiffnesses, out / "fig5.png")
+    sequence.draw6(sequences, out / "fig6.png")
     write3(elongations, out / "fig3.csv")
     write4(bendings, out / "fig4.csv")
     write5(stiffnesses, out / "fig5.csv")
+    sequence.write6(sequences, out / "fig6.csv")
     comparisons = [
         *(c for data in elongations for c in compare3(data)),
         *(c for data in bendings for c in compare4(data)),
         *(c for data in stiffnesses for c in compare5(data)),
     ]
-    claims = [*map(claim_antagonism, bendings), *(c for data in stiffnesses for c in claims_stiffness(data))]
+    claims = [
+        *map(claim_antagonism, bendings),
+        *(c for data in stiffnesses for c in claims_stiffness(data)),
+        *(Claim(*row) for row in sequence.agreement(sequences, laws.values())),
+    ]
     text = report(comparisons, claims, weights(), all_gaps(bendings, stiffnesses))
     write_agreement(comparisons, out / "agreement.csv")
     (out / "agreement.md").write_text(text, encoding="utf-8")
     say(text)
-    say(f"wrote fig3, fig4, fig5 (.png, .csv) and agreement (.md, .csv) in {out}")
+    say(f"wrote fig3 to fig6 (.png, .csv) and agreement (.md, .csv) in {out}")

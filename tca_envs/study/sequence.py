@@ -187,19 +187,19 @@ def draw6(sequences: dict[str, list[Frame]], path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    columns, rows, wide, high = len(PANELS), len(sequences), 1.75, 4.1  # panels [inch]
+    columns, rows, wide, high, side = len(PANELS), len(sequences), 1.75, 4.7, 4.1  # panels and 3D views [inch]
     figure = Figure(figsize=(wide * columns + 0.3, high * rows + 0.35))
     for row, (case, frames) in enumerate(sequences.items()):
         bottom = 0.35 + high * (rows - 1 - row)
         for column, frame in enumerate(frames):
             middle = 0.3 + wide * (column + 0.5)
             # A 3D view is a square, so neighbours overlap.
-            rectangle = (middle - 0.5 * high, bottom - 0.3, high, high)
+            rectangle = (middle - 0.5 * side, bottom - 0.1, side, side)
             axes = figure.add_axes(inches(figure, rectangle), projection="3d", computed_zorder=False)
             draw_frame(cast("Axes3D", axes), frame)
             holding = "held" if frame.scene[grasp.HELD] > 0.5 else "on the table"
             figure.text(
-                *inches(figure, (middle, bottom + high - 0.08)),
+                *inches(figure, (middle, bottom + high - 0.1)),
                 f"({'abcdefg'[column]}) {frame.label}\nyaw {round(frame.yaw)}°, gap {1e3 * frame.gap:.1f} mm\nobject {holding}",
                 fontsize=9, ha="center", va="top",
             )  # fmt: skip
@@ -252,10 +252,10 @@ def draw_frame(axes: "Axes3D", frame: Frame) -> None:
         axes.plot(*(1e3 * points.T), color="black", lw=3, zorder=5, solid_capstyle="butt")
     draw_box(axes, frame.scene)
     table = 1e3 * presets.SITE.table
-    x, y = np.meshgrid([-14.0, 24.0], [-14.0, 14.0])
+    x, y = np.meshgrid([-9.0, 19.0], [-9.0, 9.0])
     axes.plot_surface(x, y, np.full_like(x, table), color="0.75", alpha=0.5, zorder=0)
     axes.set(xlim=(-14, 24), ylim=(-14, 14), zlim=(table + 3.0, -3.0))
-    axes.set_box_aspect((38, 28, table + 6.0), zoom=1.3)
+    axes.set_box_aspect((38, 28, table + 6.0), zoom=1.12)
     axes.patch.set_alpha(0.0)
     axes.view_init(elev=14, azim=-72)
     axes.set_axis_off()

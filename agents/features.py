@@ -1,0 +1,33 @@
+"""What the networks are shown of an observation, where plain numbers make learning hard."""
+
+from typing import Any
+
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+
+class PickAndPlaceFeatures(BaseFeaturesExtractor):
+    """The observation of TCAPickAndPlace and differences that decide what to do next.
+
+    Half a millimetre decides whether the jaws fit, on coordinates of centimetres: differences tool - object and object - target are
+    added in cm and, for the last millimetres, as tanh(d/2 mm); so is twice the yaw between jaws and object.
+
+    Parameters
+    ----------
+    observation_space : gymnasium.spaces.Dict
+        Of the environment.
+    """
+
+    def __init__(self, observation_space: spaces.Dict) -> None:
+        numbers = sum(int(space.shape[0]) for space in observation_space.values() if space.shape)
+        super().__init__(observation_space, numbers + 2 * 6 + 2)
+
+    def forward(self, observation: dict[str, Any]) -> torch.Tensor:
+        """Return the features (N, k)."""
+        seen, achieved, desired = (observation[key] for key in ("observation", "achieved_goal", "desired_goal"))
+        c, s = seen[:, 13], seen[:, 14]
+        cosine, sine = c * c - s * s, 2.0 * c * s
+        turn = (cosine * seen[:, 21] + sine * seen[:, 22], cosine * seen[:, 22] - sine * seen[:, 21])
+        away = torch.cat([seen[:, 18:21] - seen[:, 10:13], desired[:, :3] - achieved[:, :3]], dim=1)
+        return torch.cat([seen, achieved, desired, away, torch.tanh(5.0 * away), torch.stack(turn, dim=1)], dim=1)
