@@ -10,8 +10,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 class PickAndPlaceFeatures(BaseFeaturesExtractor):
     """The observation of TCAPickAndPlace and differences that decide what to do next.
 
-    Half a millimetre decides whether the jaws fit, on coordinates of centimetres: differences tool - object and object - target are
-    added in cm and, for the last millimetres, as tanh(d/2 mm); so is twice the yaw between jaws and object.
+    Half a millimetre decides whether the jaws fit, on coordinates of centimetres: the ways from tool to object and from object
+    to target are added in cm and, for the last millimetres, as tanh(d/2 mm); so is twice the yaw between jaws and object.
 
     Parameters
     ----------

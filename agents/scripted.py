@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from tca_envs import presets
 from tca_envs.mechanics import Arm, Equilibrium, grasp, thermal
+from tca_envs.mechanics.rotation import yaw_angle
 from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT, Heater
 from tca_envs.tasks.core import STEP_S
 from tca_envs.tasks.pick_and_place import FULL_FORCE
-from tca_envs.tasks.task import yaw
 from tca_envs.tasks.twist_align import SUCCESS_CM, SUCCESS_DEG
 
 Array = NDArray[np.float64]
@@ -99,9 +99,9 @@ class PickAndPlaceController:
 
     The state is read off the observation at every step, so that a slip or a missed grasp leads back to where it belongs:
 
-    1. `align`: bend and twist until the tool is over the object with its yaw; near it the gripper begins to open;
-    2. `open`: heat the gripper until the object fits between the jaws;
-    3. `lower`: until the jaws are around the object's middle;
+    1. `align`: bend and twist until the tool is over the object with its yaw;
+    2. `open`: heat the gripper, from when the tool is near;
+    3. `lower`: as long as the object fits between the jaws, until they are around its middle;
     4. `close`: let the gripper cool until friction holds the object;
     5. `lift`: the stage up;
     6. `untwist`: the helix cools;
@@ -140,10 +140,10 @@ class PickAndPlaceController:
             bent = np.full(4, AMBIENT)
         else:
             bent = self._plan("object", np.append(scene.object[:2], scene.object_yaw))
-        near = float(np.linalg.norm(scene.object[:2] - scene.tool[:2])) < NEAR and scene.turn < NEAR_YAW
-        wide_open = phase in ("open", "lower", "release") or (phase == "leave" and scene.low) or (phase == "align" and near)
-        jaws = OPEN if wide_open else AMBIENT
-        speed = {"lower": 1.0, "open": 0.0, "close": 0.0, "release": 0.0}.get(phase, -1.0)
+        hot = phase in ("open", "lower", "release") or (phase == "align" and scene.near) or (phase == "leave" and scene.low)
+        jaws = OPEN if hot else AMBIENT
+        down = {"lower": 1.0, "open": 0.0, "close": 0.0, "release": 0.0, "align": -1.0 if scene.low else 0.0}
+        speed = down.get(phase, -1.0)
         bending, opening = self.heating.part(slice(4)), self.heating.part(slice(4, 5))
         action = [*drive(temperature[:4], bent, bending), *drive(temperature[4:], np.array([jaws]), opening), speed]
         return np.array(action, dtype=np.float32), None
@@ -158,16 +158,13 @@ class PickAndPlaceController:
             return "carry" if abs(scene.yaw) < UNTWISTED else "untwist"
         if np.linalg.norm(scene.object[:2] - scene.target) < PLACED:
             return "leave"
-        tool, turn = scene.tool, scene.turn
-        beside = float(np.linalg.norm(scene.object[:2] - tool[:2]))
-        if scene.between and tool[2] > scene.object[2] - GRASP_DEPTH:
+        if scene.between and scene.tool[2] > scene.object[2] - GRASP_DEPTH:
             return "close"
-        needed = 2.0 * (float(grasp.half_extents(np.array(turn), presets.OBJECT)[0]) + beside) + MARGIN
-        if scene.low:
-            return "lower" if scene.gap > needed else "align"
-        if beside > ALIGNED or turn > ALIGNED_YAW:
+        if not scene.low and not scene.near:
             return "align"
-        return "lower" if scene.gap > needed else "open"
+        if scene.gap < WIDE:
+            return "open"
+        return "lower" if scene.fits and (scene.between or not scene.low) else "align"
 
     def _plan(self, name: str, goal: Array) -> Array:
         """Return the temperatures (4,) [degC] that bring the tool to `goal`: x, y [m] and perhaps a yaw [rad] modulo pi."""
@@ -184,14 +181,12 @@ class PickAndPlaceController:
         return temperatures
 
 
-OPEN = 147.0
-"""Temperature of the open gripper [degC]."""
-ALIGNED, ALIGNED_YAW = 1e-3, np.radians(8.0)
-"""Errors of the tool [m], [rad] at which the gripper opens and goes down."""
-NEAR, NEAR_YAW = 4e-3, np.radians(25.0)
-"""Errors of the tool [m], [rad] at which the gripper begins to open."""
-MARGIN = 4e-4
-"""Spare gap of the jaws [m]."""
+OPEN, WIDE = 150.0, 6e-3
+"""Temperature of the open gripper [degC], and the gap from which on it counts as open [m]."""
+NEAR, NEAR_YAW = 3e-3, np.radians(20.0)
+"""Errors of the tool [m], [rad] at which the gripper opens."""
+MARGIN, ALONG = 4e-4, 2.5e-3
+"""Spare gap of the jaws, and the largest offset of the object along their width [m]."""
 GRASP_DEPTH = 1.5e-3
 """The jaws close when they are no higher above the object's centre [m]."""
 OVER_TARGET, PLACED = 1.5e-3, 2.8e-3
@@ -227,6 +222,19 @@ class Sight:
     def turn(self) -> float:
         """Angle between jaws and object [rad], at most 90 degrees."""
         return abs(float(grasp.half_turn(np.array(self.object_yaw - self.yaw))))
+
+    @property
+    def near(self) -> bool:
+        """Whether it is time to open the gripper."""
+        return float(np.linalg.norm(self.object[:2] - self.tool[:2])) < NEAR and self.turn < NEAR_YAW
+
+    @property
+    def fits(self) -> bool:
+        """Whether the object as it lies to the jaws fits between them."""
+        x, y = self.object[:2] - self.tool[:2]
+        across, along = abs(np.cos(self.yaw) * x + np.sin(self.yaw) * y), abs(np.cos(self.yaw) * y - np.sin(self.yaw) * x)
+        reach = float(grasp.half_extents(np.array(self.turn), presets.OBJECT)[0])
+        return bool(2.0 * (reach + across) + MARGIN < self.gap and along < ALONG)
 
     @classmethod
     def of(cls, observation: dict[str, NDArray[Any]]) -> "Sight":
@@ -308,8 +316,7 @@ def unwrapped(angle: float) -> float:
 
 def yaw_of(here: Equilibrium) -> float:
     """Return the yaw of the tip [rad], unwrapped."""
-    cosine, sine = yaw(here.tip_pose[np.newaxis])
-    return unwrapped(float(np.arctan2(sine[0], cosine[0])))
+    return unwrapped(float(yaw_angle(here.tip_pose)))
 
 
 def yaw_gradient(pose: Array) -> Array:

@@ -47,8 +47,8 @@ def assert_same(first, second):
 
 
 def test_the_registry_holds_the_environments():
-    assert IDS == sorted(
-        f"TCA{task}{reward}-v0" for task in ("Reach", "TwistAlign", "PickAndPlace") for reward in ("", "Dense")
+    assert (
+        sorted(f"TCA{task}{reward}-v0" for task in ("Reach", "TwistAlign", "PickAndPlace") for reward in ("", "Dense")) == IDS
     )
 
 

@@ -18,6 +18,7 @@ from scipy.optimize import brentq
 
 from tca_envs import presets
 from tca_envs.mechanics import TCA, Arm, Equilibrium, Gripper, Payload, grasp
+from tca_envs.mechanics.rotation import yaw_angle
 from tca_envs.study import output
 
 if TYPE_CHECKING:
@@ -57,8 +58,7 @@ class Frame:
     @property
     def yaw(self) -> float:
         """Of the gripper [deg]."""
-        r = self.arm.tip_pose
-        return float(np.degrees(np.arctan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1])))
+        return float(np.degrees(yaw_angle(self.arm.tip_pose)))
 
 
 class Rig:
@@ -117,7 +117,7 @@ class Rig:
 def place(arm: Equilibrium) -> tuple[Array, float]:
     """Return the point between the jaws (3,) [m], with the stage up, and the direction in which they open [rad]."""
     r = arm.tip_pose
-    return r[:3, 3] + presets.JAW_DEPTH * r[:3, 2], float(np.arctan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1]))
+    return r[:3, 3] + presets.JAW_DEPTH * r[:3, 2], float(yaw_angle(r))
 
 
 def turns(law: TCA, temperature: Array) -> Array:
@@ -143,7 +143,7 @@ def figure6(law: TCA) -> list[Frame]:
         ((COLD, COLD, COLD, COLD, COLD), 0.0),
         ((BENT, COLD, COLD, COLD, COLD), 0.0),
     )
-    frames = []
+    frames: list[Frame] = []
     for label, (temperature, lowered) in zip(PANELS, steps, strict=True):
         if label == "lift":  # the gripper closes first, and is shown so
             rig.move(np.array(temperature))
@@ -158,8 +158,8 @@ def figure6(law: TCA) -> list[Frame]:
 def write6(sequences: dict[str, list[Frame]], path: Path) -> None:
     """Write Fig. 6 as CSV."""
     header = [
-        "case", "panel", *(f"temperature_{i}_degC" for i in range(5)), "stage_mm", "tip_x_mm", "tip_y_mm", "tip_z_mm", "yaw_deg",
-        "gap_mm", "pinch_mN", "object_x_mm", "object_y_mm", "object_z_mm", "object_yaw_deg", "held",
+        "case", "panel", *(f"temperature_{i}_degC" for i in range(5)), "stage_mm", "tip_x_mm", "tip_y_mm", "tip_z_mm",
+        "yaw_deg", "gap_mm", "pinch_mN", "object_x_mm", "object_y_mm", "object_z_mm", "object_yaw_deg", "held",
     ]  # fmt: skip
     rows = [
         (
@@ -195,15 +195,17 @@ def draw6(sequences: dict[str, list[Frame]], path: Path) -> None:
             middle = 0.3 + wide * (column + 0.5)
             # A 3D view is a square, so neighbours overlap.
             rectangle = (middle - 0.5 * side, bottom - 0.1, side, side)
-            axes = figure.add_axes(inches(figure, rectangle), projection="3d", computed_zorder=False)
+            axes = figure.add_axes(tuple(inches(figure, rectangle)), projection="3d", computed_zorder=False)
             draw_frame(cast("Axes3D", axes), frame)
             holding = "held" if frame.scene[grasp.HELD] > 0.5 else "on the table"
+            x, y = inches(figure, (middle, bottom + high - 0.1))
             figure.text(
-                *inches(figure, (middle, bottom + high - 0.1)),
+                x, y,
                 f"({'abcdefg'[column]}) {frame.label}\nyaw {round(frame.yaw)}°, gap {1e3 * frame.gap:.1f} mm\nobject {holding}",
                 fontsize=9, ha="center", va="top",
             )  # fmt: skip
-        figure.text(*inches(figure, (0.1, bottom + 0.5 * high)), case, rotation=90, va="center", fontsize=11)
+        x, y = inches(figure, (0.1, bottom + 0.5 * high))
+        figure.text(x, y, case, rotation=90, va="center", fontsize=11)
     handles = [
         Line2D([], [], color="black", lw=3, label="centerline and gripper"),
         Line2D([], [], color="#D62728", lw=2, label="hot TCA"),
@@ -215,9 +217,9 @@ def draw6(sequences: dict[str, list[Frame]], path: Path) -> None:
     output.save_figure(figure, path)
 
 
-def inches(figure: "Figure", lengths: tuple[float, ...]) -> Any:
+def inches(figure: "Figure", lengths: tuple[float, ...]) -> list[Any]:
     """Return x, y, or x, y, width, height, as fractions of the figure from inches."""
-    return tuple(length / size for length, size in zip(lengths, 2 * list(figure.get_size_inches()), strict=False))
+    return [length / size for length, size in zip(lengths, 2 * list(figure.get_size_inches()), strict=False)]
 
 
 def draw_frame(axes: "Axes3D", frame: Frame) -> None:

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from tca_envs import presets
 from tca_envs.mechanics import grasp
+from tca_envs.mechanics.rotation import yaw, yaw_angle
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT, Heater
 from tca_envs.tasks.core import STEP_S, Core, Record, solved
-from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat, yaw
+from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat
 
 SUCCESS_CM = 0.3
 """An object at rest within 3 mm of the target, the gripper clear of it, is placed."""
@@ -227,5 +228,4 @@ def tool(record: Record) -> Array:
 
 def heading(record: Record) -> Array:
     """Return the directions in which the jaws open (N,) [rad]: the tip's x axis."""
-    cosine, sine = yaw(record.tip)
-    return np.arctan2(sine, cosine)
+    return yaw_angle(record.tip)

@@ -96,14 +96,3 @@ def box_with_heat(count: int, low: list[float], high: list[float]) -> spaces.Box
         np.array([HOTTEST] * count + [1.0] * count + high, dtype=np.float32),
         dtype=np.float32,
     )
-
-
-def yaw(pose: Array) -> tuple[Array, Array]:
-    """Return cosine and sine (N,) of the turn of poses (N, 4, 4) about the vertical.
-
-    It is the twist of the swing-twist decomposition: what remains when the tilt is undone the shortest way. It does not jump,
-    for tilts below 180 degrees.
-    """
-    c, s = pose[:, 0, 0] + pose[:, 1, 1], pose[:, 1, 0] - pose[:, 0, 1]
-    norm = np.hypot(c, s)
-    return c / norm, s / norm

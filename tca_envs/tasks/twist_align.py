@@ -8,9 +8,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from tca_envs import presets
+from tca_envs.mechanics.rotation import yaw
 from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT, Heater
 from tca_envs.tasks.core import Core, Record
-from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat, yaw
+from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat
 
 SUCCESS_CM = 0.15
 """A tip within 1.5 mm of the goal is over it ..."""
