@@ -181,7 +181,7 @@ class PickAndPlaceController:
         return temperatures
 
 
-OPEN, WIDE = 150.0, 6e-3
+OPEN, WIDE = 150.0, 4.5e-3
 """Temperature of the open gripper [degC], and the gap from which on it counts as open [m]."""
 NEAR, NEAR_YAW = 3e-3, np.radians(20.0)
 """Errors of the tool [m], [rad] at which the gripper opens."""

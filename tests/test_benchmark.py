@@ -1,18 +1,23 @@
 """Speed, measured and not judged, and the accuracy that goes with it. Alone for clean numbers: pytest tests/test_benchmark.py.
 
-The scene is the one that TCAReach steps: the bending module with three TCAs and the rest of the arm hanging from it.
+The scenes are those that the environments step: the bending module with three TCAs and the rest of the arm hanging from it
+(TCAReach), and the whole arm, bending and twisting module in series, with four TCAs (TCATwistAlign, TCAPickAndPlace).
 """
 
 import itertools
+import time
 
 import numpy as np
 import pytest
 
 from tca_envs import presets
 from tca_envs.mechanics import Arm, Grid, shooting
+from tca_envs.tasks.core import CUT_OFF
 
 WARM = np.array([110.0, 60.0, 40.0])
 """Temperatures [degC] of the first state; the second is 1 degC hotter everywhere."""
+WHOLE = np.array([110.0, 60.0, 40.0, 80.0])
+"""The same for the whole arm."""
 PAPER_RTOL = 1e-6
 
 
@@ -38,6 +43,47 @@ def test_warm_solve_by_the_papers_method(benchmark, arm):
     assert result.converged
     exact = arm.equilibrium(WARM + 1.0)
     assert np.linalg.norm(result.tip_pose[:3, 3] - exact.tip_pose[:3, 3]) < 1e-6
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return presets.whole_arm()
+
+
+@pytest.mark.benchmark(group="warm solve after 1 degC, whole arm")
+def test_warm_solve_of_the_whole_arm(benchmark, whole):
+    states = itertools.cycle([whole.equilibrium(WHOLE + 1.0), whole.equilibrium(WHOLE)])
+    drives = itertools.cycle([WHOLE, WHOLE + 1.0])
+    result = benchmark(lambda: whole.equilibrium(next(drives), start=next(states)))
+    assert result.converged
+
+
+@pytest.mark.benchmark(group="warm solve after 1 degC, whole arm")
+def test_warm_solve_of_the_whole_arm_by_the_papers_method(benchmark, whole):
+    start = whole.equilibrium(WHOLE)
+    result = benchmark.pedantic(
+        lambda: shooting.equilibrium(whole, WHOLE + 1.0, start=start, rtol=PAPER_RTOL), rounds=3, iterations=1
+    )
+    assert result.converged
+    exact = whole.equilibrium(WHOLE + 1.0)
+    assert np.linalg.norm(result.tip_pose[:3, 3] - exact.tip_pose[:3, 3]) < 1e-6
+
+
+def test_the_whole_arms_warm_solve_is_a_thousand_times_faster_than_the_papers_method(whole):
+    """By 10,000 times or so: the bound holds on any machine."""
+    start = whole.equilibrium(WHOLE)
+
+    def seconds(solve, repeats):
+        taken = []
+        for _ in range(repeats):
+            begun = time.perf_counter()
+            solve()
+            taken.append(time.perf_counter() - begun)
+        return float(np.median(taken))
+
+    ours = seconds(lambda: whole.equilibrium(WHOLE + 1.0, start=start), 201)
+    theirs = seconds(lambda: shooting.equilibrium(whole, WHOLE + 1.0, start=start, rtol=PAPER_RTOL), 1)
+    assert theirs > 1000.0 * ours
 
 
 @pytest.mark.benchmark(group="cold solve")
@@ -66,3 +112,21 @@ def test_the_presets_grid_is_accurate_to_a_micrometre(arm):
         warm_fine = finer.equilibrium(np.maximum(drive - 1.0, 25.0), start=fine)
         for a, b in ((coarse, fine), (warm, warm_fine)):
             assert np.linalg.norm(a.tip_pose[:3, 3] - b.tip_pose[:3, 3]) < 1e-6
+
+
+@pytest.mark.parametrize("payload", [None, presets.with_object()], ids=["empty", "with object"])
+def test_the_whole_arms_grid_is_accurate_to_ten_micrometres(payload):
+    """Against ten times as many elements, at random temperatures and in all corners up to the heaters' cut-off."""
+    arm = presets.whole_arm(payload=payload)
+    grids = [Grid(10 * grid.elements, grid.nodes) for grid in arm.grids]
+    finer = Arm(arm.modules, arm.gravity, arm.payload, grids, tolerance=1e-9)
+    rng = np.random.default_rng(0)
+    drives = [*rng.uniform(25.0, CUT_OFF, (12, 4)), *map(np.array, itertools.product((25.0, CUT_OFF), repeat=4))]
+    for drive in drives:
+        coarse = arm.equilibrium(drive)
+        fine = finer.equilibrium(drive, start=coarse)
+        assert coarse.converged and fine.converged
+        warm = arm.equilibrium(np.maximum(drive - 1.0, 25.0), start=coarse)
+        warm_fine = finer.equilibrium(np.maximum(drive - 1.0, 25.0), start=fine)
+        for a, b in ((coarse, fine), (warm, warm_fine)):
+            assert np.linalg.norm(a.tip_pose[:3, 3] - b.tip_pose[:3, 3]) < 1e-5

@@ -1,0 +1,118 @@
+"""PickAndPlace: where object and target lie, what is observed, and what counts as placed."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import tca_envs  # noqa: F401
+from agents.scripted import PickAndPlaceController
+from tca_envs import presets
+from tca_envs.mechanics import grasp
+from tca_envs.tasks.pick_and_place import APART_CM, PickAndPlace, heading, tool
+
+AT_REST_CM = 8.28
+
+
+@pytest.fixture(scope="module")
+def task():
+    return PickAndPlace("train")
+
+
+def test_the_object_lies_10_mm_under_the_jaws_of_the_cold_arm(task):
+    core = task.core(1)
+    below = grasp.resting(presets.OBJECT, presets.SITE) - tool(core.rest)[0, 2]
+    assert below == pytest.approx(10e-3, abs=0.1e-3)
+
+
+@pytest.mark.parametrize("split", ["train", "held-out"])
+def test_object_and_target_can_be_reached_and_come_from_their_split(split):
+    task = PickAndPlace(split)
+    core = task.core(1)
+    drawn, settle = [], core.settle
+
+    def remember(temperature, payload=None):
+        drawn.append((temperature[0].copy(), payload))
+        return settle(temperature, payload)
+
+    core.settle = remember
+    goals, scenes = task.draw(core, np.random.default_rng(0), 20)
+    for (first, empty), (last, full) in zip(drawn[::2], drawn[1::2], strict=True):
+        assert task.of_this_split(np.append(first, last[:3]))
+        assert empty is None and full[0] == pytest.approx(presets.GRIPPER_MASS + presets.OBJECT.mass)
+        assert (first[:3] <= 100.0).all() and first[3] <= 125.0 and (last[:3] <= 120.0).all() and last[3] == 25.0
+    # The last pair is the last episode's.
+    here, there = settle(drawn[-2][0][np.newaxis])[0], settle(drawn[-1][0][np.newaxis], drawn[-1][1])[0]
+    np.testing.assert_allclose(scenes[-1, [grasp.X, grasp.Y]], tool(here)[0, :2], atol=1e-12)
+    np.testing.assert_allclose(goals[-1, :2], 100.0 * tool(there)[0, :2], atol=1e-10)
+    assert np.sin(2.0 * (scenes[-1, grasp.YAW] - heading(here)[0])) == pytest.approx(0.0, abs=1e-9)
+    assert (np.linalg.norm(goals[:, :2] - 100.0 * scenes[:, [grasp.X, grasp.Y]], axis=1) >= APART_CM).all()
+    np.testing.assert_allclose(goals[:, 2], AT_REST_CM)
+    assert (goals[:, 3] == 1.0).all() and (scenes[:, grasp.HELD] == 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("achieved", "success"),
+    [
+        ([0.0, 0.0, AT_REST_CM, 1.0], True),
+        ([0.29, 0.0, AT_REST_CM, 1.0], True),
+        ([0.0, 0.31, AT_REST_CM, 1.0], False),
+        ([0.0, 0.0, AT_REST_CM, 0.0], False),
+        ([0.0, 0.0, AT_REST_CM - 0.5, 1.0], False),
+    ],
+    ids=str,
+)
+def test_success_takes_the_place_and_the_gripper_away(task, achieved, success):
+    desired = np.array([0.0, 0.0, AT_REST_CM, 1.0])
+    assert bool(task.success(np.array(achieved), desired)) is success
+    assert gym.make("TCAPickAndPlace-v0").unwrapped.compute_reward(np.array(achieved), desired, {}) == success - 1.0
+    distance = np.linalg.norm(np.array(achieved)[:3] - desired[:3])
+    dense = gym.make("TCAPickAndPlaceDense-v0").unwrapped.compute_reward(np.array(achieved), desired, {})
+    assert dense == pytest.approx(-distance)
+
+
+def test_a_held_or_straddled_object_is_not_free(task):
+    record = task.core(3).record
+    record.scene[:, grasp.HELD], record.scene[:, grasp.ASTRIDE] = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
+    assert task.achieved(record)[:, 3].tolist() == [0.0, 0.0, 1.0]
+
+
+def test_the_observation_says_what_is_there():
+    """Through an episode that the scripted controller solves, against the record, column by column."""
+    env, controller = gym.make("TCAPickAndPlace-v0"), PickAndPlaceController()
+    observation, info = env.reset(seed=1)
+    core = env.unwrapped.core
+    held = forces = 0
+    for _ in range(150):
+        observation, _, _, _, info = env.step(controller.predict(observation)[0])
+        seen, record, scene = observation["observation"].astype(float), core.record, core.record.scene[0]
+        np.testing.assert_allclose(25.0 + 125.0 * seen[:5], record.temperature[0], atol=1e-4)
+        np.testing.assert_allclose(seen[5:10] * core.heating.max_power, record.power[0], atol=1e-5)
+        point = tool(record)[0] + [0.0, 0.0, scene[grasp.STAGE]]
+        np.testing.assert_allclose(seen[10:13], 100.0 * point, atol=1e-5)
+        assert np.arctan2(seen[14], seen[13]) == pytest.approx(heading(record)[0], abs=1e-6)
+        assert seen[15] * 15e-3 == pytest.approx(scene[grasp.STAGE], abs=1e-8)
+        np.testing.assert_allclose(seen[18:21], 100.0 * scene[[grasp.X, grasp.Y, grasp.Z]], atol=1e-5)
+        np.testing.assert_allclose(seen[18:21], observation["achieved_goal"][:3], atol=0.0)
+        assert seen[21] == pytest.approx(np.cos(2.0 * scene[grasp.YAW]), abs=1e-6)
+        assert seen[22] == pytest.approx(np.sin(2.0 * scene[grasp.YAW]), abs=1e-6)
+        between = scene[grasp.HELD] + scene[grasp.ASTRIDE] > 0.5
+        opening = float(presets.gripper().gap(record.temperature[0, 4]))
+        assert seen[16] == pytest.approx(100.0 * max(opening, 3e-3 * between), abs=1e-6)
+        if scene[grasp.HELD] > 0.5:
+            held += 1
+            pinch = presets.gripper().pinch(record.temperature[0, 4], presets.OBJECT.width)
+            assert 0.05 * seen[17] == pytest.approx(float(pinch), abs=1e-5)
+            assert record.payload[0, 0] == pytest.approx(presets.GRIPPER_MASS + presets.OBJECT.mass)
+        elif not between:
+            assert seen[17] == 0.0
+            np.testing.assert_allclose(record.payload, core.rest.payload)
+        forces += seen[17] > 0.0
+        assert info["is_success"] is bool(env.unwrapped.task.success(observation["achieved_goal"], observation["desired_goal"]))
+    assert held > 20 and forces >= held and info["is_success"]
+
+
+def test_the_tool_is_between_the_jaws_of_the_drawn_ring():
+    """The jaws of the closed ring meet where the tool is."""
+    ring = presets.gripper()
+    jaw = ring.half().equilibrium([25.0]).tip_pose[:3, 3]
+    assert presets.JAW_DEPTH == pytest.approx(jaw[0], abs=1e-6) and jaw[2] == pytest.approx(0.0, abs=1e-6)
