@@ -161,12 +161,20 @@ def environments(settings: dict[str, Any], seed: int) -> Any:
     """Return the vector of training environments."""
     from stable_baselines3.common.env_util import make_vec_env
 
-    return make_vec_env(lambda: gymnasium.make(settings["env"]), n_envs=settings["envs"], seed=seed)
+    def make() -> gymnasium.Env[Any, Any]:
+        env = gymnasium.make(settings["env"])
+        if "done_steps" not in settings:
+            return env
+        from agents.dagger import EndWhenDone
+
+        return EndWhenDone(env, settings["done_steps"])
+
+    return make_vec_env(make, n_envs=settings["envs"], seed=seed)
 
 
 def build(algorithm: str, settings: dict[str, Any], options: argparse.Namespace) -> Any:
     """Return a fresh model."""
-    extra = {name: value for name, value in settings.items() if name not in ("env", "steps", "envs")}
+    extra = {name: value for name, value in settings.items() if name not in ("env", "steps", "envs", "done_steps")}
     return learner(algorithm)(
         "MultiInputPolicy", environments(settings, options.seed), seed=options.seed, device=options.device, **extra
     )

@@ -1,14 +1,15 @@
 """DAgger: a policy learns what a scripted controller would do in the situations that the policy itself comes into.
 
 S. Ross, G. Gordon and D. Bagnell, "A reduction of imitation learning and structured prediction to no-regret online learning",
-AISTATS 2011. The first round is driven by the controller, later ones by the policy; the controller's actions are
-recorded everywhere, and after every round the policy is fitted to all that has been recorded.
+AISTATS 2011. The first rounds are driven by the controller, later ones by the policy; the controller's actions are recorded
+everywhere, and after every round the policy is fitted to all that has been recorded.
 """
 
 import pickle
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,7 +19,37 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from agents.features import PickAndPlaceFeatures
 from agents.scripted import CONTROLLERS
 
+EXPERT_STEPS = 30_000
+"""Steps that the controller drives before the policy takes over."""
 Observations = dict[str, NDArray[np.float32]]
+
+
+class EndWhenDone(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """End an episode when its goal has been held for some steps: what comes then teaches nothing new.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+        Its info has `is_success`.
+    steps : int
+        How long.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], steps: int) -> None:
+        super().__init__(env)
+        self.steps = steps
+        self.held = 0
+
+    def reset(self, **options: Any) -> Any:
+        """Reset the environment."""
+        self.held = 0
+        return self.env.reset(**options)
+
+    def step(self, action: Any) -> Any:
+        """Step the environment."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.held = self.held + 1 if info["is_success"] else 0
+        return observation, reward, terminated, truncated or self.held >= self.steps, info
 
 
 class DAgger(PPO):
@@ -70,7 +101,7 @@ class DAgger(PPO):
         observation = self.env.reset()
         going_on = True
         while going_on and self.num_timesteps < total_timesteps:
-            by_expert = not self.record
+            by_expert = self.num_timesteps < EXPERT_STEPS
             for _ in range(self.n_steps):
                 assert isinstance(observation, dict)
                 lanes = [{key: value[i] for key, value in observation.items()} for i in range(len(experts))]

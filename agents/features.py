@@ -11,7 +11,8 @@ class PickAndPlaceFeatures(BaseFeaturesExtractor):
     """The observation of TCAPickAndPlace and differences that decide what to do next.
 
     Half a millimetre decides whether the jaws fit, on coordinates of centimetres: the ways from tool to object and from object
-    to target are added in cm and, for the last millimetres, as tanh(d/2 mm); so is twice the yaw between jaws and object.
+    to target are added in cm and, for the last millimetres, as tanh(d/2 mm), the former also across and along the jaws; so is
+    twice the yaw between jaws and object.
 
     Parameters
     ----------
@@ -21,7 +22,7 @@ class PickAndPlaceFeatures(BaseFeaturesExtractor):
 
     def __init__(self, observation_space: spaces.Dict) -> None:
         numbers = sum(int(space.shape[0]) for space in observation_space.values() if space.shape)
-        super().__init__(observation_space, numbers + 2 * 6 + 2)
+        super().__init__(observation_space, numbers + 2 * 8 + 2)
 
     def forward(self, observation: dict[str, Any]) -> torch.Tensor:
         """Return the features (N, k)."""
@@ -29,5 +30,13 @@ class PickAndPlaceFeatures(BaseFeaturesExtractor):
         c, s = seen[:, 13], seen[:, 14]
         cosine, sine = c * c - s * s, 2.0 * c * s
         turn = (cosine * seen[:, 21] + sine * seen[:, 22], cosine * seen[:, 22] - sine * seen[:, 21])
-        away = torch.cat([seen[:, 18:21] - seen[:, 10:13], desired[:, :3] - achieved[:, :3]], dim=1)
+        x, y, _ = (seen[:, 18:21] - seen[:, 10:13]).T
+        away = torch.cat(
+            [
+                seen[:, 18:21] - seen[:, 10:13],
+                torch.stack([c * x + s * y, c * y - s * x], dim=1),
+                desired[:, :3] - achieved[:, :3],
+            ],
+            dim=1,
+        )
         return torch.cat([seen, achieved, desired, away, torch.tanh(5.0 * away), torch.stack(turn, dim=1)], dim=1)

@@ -96,8 +96,9 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
         },
         "dagger": {
             "env": "TCAPickAndPlaceDense-v0",
-            "steps": 300_000,
+            "steps": 600_000,
             "envs": 10,
+            "done_steps": 40,
             "controller": "pick-and-place",
             "policy_kwargs": {"net_arch": {"pi": [256, 256], "vf": [1]}},
             "learning_rate": decaying,
@@ -107,5 +108,5 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
         },
     },
 }
-"""`env`, `steps` and `envs` are the environment, the default number of its steps and how many are stepped together;
-the rest goes to the learner."""
+"""`env`, `steps` and `envs` are the environment, the default number of its steps and how many are stepped together,
+`done_steps` ends training episodes whose goal has been held for so long; the rest goes to the learner."""

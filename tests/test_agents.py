@@ -6,8 +6,23 @@ import pytest
 
 import tca_envs  # noqa: F401
 from agents.evaluate import evaluate, wilson
-from agents.scripted import RandomPolicy, ReachController, plan
+from agents.scripted import (
+    BENDING_STARTS,
+    PickAndPlaceController,
+    RandomPolicy,
+    ReachController,
+    Sight,
+    TwistAlignController,
+    plan,
+    tip_and_yaw_at,
+    tip_at,
+    tool_at,
+    yaw_gradient,
+    yaw_of,
+)
 from tca_envs import presets
+from tca_envs.mechanics import grasp
+from tca_envs.mechanics.rotation import yaw_angle
 
 
 def reach_success(episodes):
@@ -56,8 +71,105 @@ def test_reach_controller_heats_a_hot_tca_less_and_plans_anew_for_a_new_goal():
 def test_plan_finds_the_temperatures_of_a_reachable_tip():
     arm = presets.bending_arm()
     tip = arm.equilibrium([60.0, 120.0, 30.0]).tip_pose[:3, 3]
-    found = arm.equilibrium(plan(arm, tip)).tip_pose[:3, 3]
+    found = arm.equilibrium(plan(arm, tip_at(tip), BENDING_STARTS)).tip_pose[:3, 3]
     assert np.linalg.norm(found - tip) < 5e-5
+
+
+def test_yaw_gradient_is_that_of_differences():
+    arm = presets.whole_arm()
+    here = arm.equilibrium([110.0, 60.0, 40.0, 80.0])
+    gradient = yaw_gradient(here.tip_pose) @ here.tip_jacobian[3:]
+    for i in range(4):
+        step = 0.01 * np.eye(4)[i]
+        up, down = (yaw_of(arm.equilibrium(here.drive + sign * step, start=here)) for sign in (1.0, -1.0))
+        assert gradient[i] == pytest.approx((up - down) / 0.02, rel=1e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("aim", ["tip and yaw", "tool", "tool and yaw"])
+def test_jacobians_of_aims_are_those_of_differences(aim):
+    arm = presets.whole_arm()
+    make = {
+        "tip and yaw": tip_and_yaw_at(np.zeros(3), 0.0),
+        "tool": tool_at(np.zeros(2), None),
+        "tool and yaw": tool_at(np.zeros(2), -1.0),
+    }[aim]
+    here = arm.equilibrium([110.0, 60.0, 40.0, 80.0])
+    _, jacobian = make(here)
+    for i in range(4 if aim != "tool" else 3):
+        step = 0.01 * np.eye(4)[i]
+        up, down = (make(arm.equilibrium(here.drive + sign * step, start=here))[0] for sign in (1.0, -1.0))
+        np.testing.assert_allclose(jacobian[:, i], (down - up) / 0.02, rtol=2e-3, atol=2e-8)
+
+
+def twist_align_success(episodes):
+    return evaluate(TwistAlignController(), gym.make("TCATwistAlign-v0", split="held-out"), episodes, seed=50_000)
+
+
+def test_twist_align_controller_solves_held_out_goals():
+    report = twist_align_success(100)
+    assert report.success_rate >= 0.99
+    assert report.solver_failures == 0
+
+
+@pytest.mark.slow
+def test_twist_align_controller_solves_a_thousand_held_out_goals():
+    assert twist_align_success(1000).success_rate >= 0.99
+
+
+def pick_and_place_success(episodes):
+    return evaluate(PickAndPlaceController(), gym.make("TCAPickAndPlace-v0", split="held-out"), episodes, seed=50_000)
+
+
+def test_pick_and_place_controller_solves_held_out_episodes():
+    report = pick_and_place_success(40)
+    assert report.successes >= 39
+    assert report.solver_failures == 0
+
+
+@pytest.mark.slow
+def test_pick_and_place_controller_solves_two_hundred_held_out_episodes():
+    assert pick_and_place_success(200).success_rate >= 0.95
+
+
+def test_pick_and_place_goes_through_the_papers_sequence():
+    env, controller = gym.make("TCAPickAndPlace-v0"), PickAndPlaceController()
+    observation, _ = env.reset(seed=1)
+    phases = []
+    for _ in range(300):
+        phase = controller.phase(Sight.of(observation))
+        if phases[-1:] != [phase]:
+            phases.append(phase)
+        observation, *_ = env.step(controller.predict(observation)[0])
+    assert phases == ["align", "open", "lower", "close", "lift", "untwist", "carry", "release", "leave"]
+
+
+def test_pick_and_place_begins_again_where_the_object_was_lost():
+    """The object is knocked out of the jaws while it is carried, and lands elsewhere."""
+    env, controller = gym.make("TCAPickAndPlace-v0"), PickAndPlaceController()
+    observation, _ = env.reset(seed=1)
+    knocked = False
+    for _ in range(300):
+        if not knocked and controller.phase(Sight.of(observation)) == "carry":
+            scene = env.unwrapped.core.record.scene[0]
+            scene[grasp.HELD], scene[grasp.DROP], scene[grasp.Z] = 0.0, 0.0, grasp.resting(presets.OBJECT, presets.SITE)
+            scene[grasp.X] += 2e-3
+            env.unwrapped.core.record.payload[:] = env.unwrapped.core.rest.payload
+            knocked = True
+        observation, *_, info = env.step(controller.predict(observation)[0])
+    assert knocked and info["is_success"]
+
+
+def test_what_pick_and_place_sees_is_what_there_is():
+    env, controller = gym.make("TCAPickAndPlace-v0"), PickAndPlaceController()
+    observation, _ = env.reset(seed=1)
+    for _ in range(50):
+        observation, *_ = env.step(controller.predict(observation)[0])
+        sight, record = Sight.of(observation), env.unwrapped.core.record
+        np.testing.assert_allclose(sight.temperature, record.temperature[0], atol=1e-4)
+        assert sight.held == (record.scene[0, grasp.HELD] > 0.5)
+        assert sight.yaw == pytest.approx(yaw_angle(record.tip[0]), abs=1e-6)
+        np.testing.assert_allclose(sight.object, record.scene[0, [grasp.X, grasp.Y, grasp.Z]], atol=1e-7)
+        assert np.sin(2.0 * (sight.object_yaw - record.scene[0, grasp.YAW])) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_random_policy_fails_and_repeats():

@@ -115,4 +115,4 @@ def test_the_tool_is_between_the_jaws_of_the_drawn_ring():
     """The jaws of the closed ring meet where the tool is."""
     ring = presets.gripper()
     jaw = ring.half().equilibrium([25.0]).tip_pose[:3, 3]
-    assert presets.JAW_DEPTH == pytest.approx(jaw[0], abs=1e-6) and jaw[2] == pytest.approx(0.0, abs=1e-6)
+    assert pytest.approx(jaw[0], abs=1e-6) == presets.JAW_DEPTH and jaw[2] == pytest.approx(0.0, abs=1e-6)

@@ -18,7 +18,8 @@ from tca_envs.study import output, paper
 COARSE = np.linspace(25.0, 160.0, 28)
 """[degC]"""
 PAPER_FILES = {
-    "fig3.png", "fig3.csv", "fig4.png", "fig4.csv", "fig5.png", "fig5.csv", "agreement.md", "agreement.csv",
+    "fig3.png", "fig3.csv", "fig4.png", "fig4.csv", "fig5.png", "fig5.csv",
+    "fig6.png", "fig6.csv", "agreement.md", "agreement.csv",
 }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import pickle
 import signal
 import subprocess
 import sys
@@ -85,6 +86,20 @@ def test_ppo_trains_and_goes_on_without_a_replay_buffer(tmp_path):
         assert [int(float(row["steps"])) for row in csv.DictReader(file)][-1] == 4096
 
 
+def test_dagger_imitates_the_controller_and_goes_on_with_its_record(tmp_path):
+    folder = tmp_path / "dagger"
+    done = run("--task", "pick-and-place", "--out", folder, "--steps", 2000, "--episodes", 1)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((folder / "policy.json").read_text())["algo"] == "dagger"
+    done = run("--resume", folder, "--steps", 1000, "--episodes", 1)
+    assert done.returncode == 0, done.stderr
+    with (folder / "replay_buffer.pkl").open("rb") as file:
+        record = pickle.load(file)
+    assert sum(len(actions) for _, actions in record) == 3000
+    report = json.loads((folder / "report.json").read_text())
+    assert report["held_out"]["scripted"]["success_rate"] == 1.0
+
+
 def test_a_fresh_run_leaves_nothing_of_an_earlier_one(tmp_path, monkeypatch):
     folder = tmp_path / "again"
     folder.mkdir()
@@ -125,8 +140,8 @@ def test_ctrl_c_saves_what_there_is(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--task", "juggle"], "--task juggle: unknown; the tasks are reach"),
-        (["--algo", "dqn"], "--algo dqn: unknown; the algorithms are sac, ppo"),
+        (["--task", "juggle"], "--task juggle: unknown; the tasks are reach, twist-align, pick-and-place"),
+        (["--algo", "dqn"], "--algo dqn: unknown; the algorithms are sac, ppo, dagger"),
         (["--steps", "0"], "--steps 0: expected a positive integer"),
         (["--episodes", "-3"], "--episodes -3: expected a positive integer"),
         (["--seed", "-1"], "--seed -1: expected an integer of at least 0"),
