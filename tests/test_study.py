@@ -1,8 +1,10 @@
 """The studies: what the figures show physically, what the command writes, gaps, bad arguments."""
 
 import csv
+import io
 import subprocess
 import sys
+from contextlib import redirect_stdout
 from dataclasses import replace
 from math import isnan, nan
 from types import SimpleNamespace
@@ -11,9 +13,10 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from tca_envs.mechanics import Arm
+from tca_envs import presets
+from tca_envs.mechanics import TCA, Arm, grasp
 from tca_envs.study import __main__ as command
-from tca_envs.study import output, paper
+from tca_envs.study import output, paper, sequence
 
 COARSE = np.linspace(25.0, 160.0, 28)
 """[degC]"""
@@ -221,7 +224,9 @@ def test_a_ratio_below_the_papers_refutes_the_statement_on_antagonism():
 def written(tmp_path_factory):
     """The folder that the command writes, two levels below one that exists."""
     folder = tmp_path_factory.mktemp("study") / "new" / "paper"
-    assert command.main(["paper", "--out", str(folder)]) == 0
+    with redirect_stdout(io.StringIO()) as printed:
+        assert command.main(["paper", "--out", str(folder)]) == 0
+    (folder.parent / "printed.txt").write_text(printed.getvalue(), encoding="utf-8")
     return folder
 
 
@@ -292,11 +297,10 @@ def test_the_agreement_says_where_model_and_paper_part(written):
     assert text.rstrip().endswith("None."), "every solve finds its equilibrium"
 
 
-def test_the_agreement_is_printed(tmp_path, capsys):
-    assert command.main(["paper", "--out", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out
-    assert printed.startswith((tmp_path / "agreement.md").read_text(encoding="utf-8"))
-    assert str(tmp_path) in printed.splitlines()[-1]
+def test_the_agreement_is_printed(written):
+    printed = (written.parent / "printed.txt").read_text(encoding="utf-8")
+    assert printed.startswith((written / "agreement.md").read_text(encoding="utf-8"))
+    assert str(written) in printed.splitlines()[-1]
 
 
 def test_gaps_are_drawn_written_and_told(tmp_path, monkeypatch, capsys):
@@ -305,8 +309,8 @@ def test_gaps_are_drawn_written_and_told(tmp_path, monkeypatch, capsys):
 
     def failing(arm, drive, **rest):
         result = solve(arm, drive, **rest)
-        # TCA 2 at 100 degC in Fig. 4, every solve at 150 degC in Fig. 5.
-        fails = drive[-1] == 100.0 or np.all(np.asarray(drive) == 150.0)
+        # TCA 2 at 100 degC in Fig. 4, every solve at 150 degC in Fig. 5, the paper set's helix at 100 degC in Fig. 6.
+        fails = len(drive) > 1 and (drive[-1] == 100.0 or np.all(np.asarray(drive) == 150.0))
         return replace(result, converged=False) if fails else result
 
     monkeypatch.setattr(Arm, "equilibrium", failing)
@@ -315,6 +319,7 @@ def test_gaps_are_drawn_written_and_told(tmp_path, monkeypatch, capsys):
     for case in paper.CASES:
         assert f"* Fig. 4, {case.name}, with passive TCA: 100 °C" in text
         assert f"* Fig. 5, {case.name}, 150 °C: 0, 0.001, 0.002," in text
+    assert "* Fig. 6, paper set: on the way to panels b, c, d, e, f, g" in text
     assert "no equilibrium at 5" in text and "no equilibrium at 1" in text
     _, rows = read(tmp_path / "fig4.csv")
     missing = [row for row in rows if row[2] == "nan"]
@@ -373,3 +378,68 @@ def test_the_studies_load_without_matplotlib_and_pyplot_stays_untouched():
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
+
+
+# Fig. 6.
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return sequence.figure6(TCA.hardware())
+
+
+def test_figure_6_picks_up_and_puts_down(frames):
+    assert [frame.label for frame in frames] == list(sequence.PANELS)
+    start, twist, opened, closed, lifted, untwisted, placed = frames
+    height = presets.OBJECT.height
+    assert twist.yaw == pytest.approx(sequence.OBJECT_YAW, abs=1.0)
+    assert start.gap == pytest.approx(0.0, abs=1e-9) and opened.gap > presets.OBJECT.width
+    assert [frame.scene[grasp.HELD] for frame in frames] == [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0]
+    for frame in (start, twist, opened, closed, placed):
+        assert frame.scene[grasp.Z] == pytest.approx(presets.SITE.table - 0.5 * height, abs=1e-6)
+    assert closed.scene[grasp.Z] - lifted.scene[grasp.Z] == pytest.approx(closed.scene[grasp.STAGE], abs=1e-5)
+    assert closed.scene[grasp.STAGE] == pytest.approx(sequence.LOWERED, rel=0.1)
+    assert untwisted.yaw == pytest.approx(0.0, abs=1.0)
+    # The object turns with the gripper.
+    turned = np.degrees(untwisted.scene[grasp.YAW] - lifted.scene[grasp.YAW])
+    assert turned == pytest.approx(untwisted.yaw - lifted.yaw, abs=1e-6)
+    assert 2.0 * presets.OBJECT.friction * lifted.pinch > presets.OBJECT.mass * 9.81
+    assert placed.scene[grasp.X] > 5e-3 and abs(placed.scene[grasp.Y]) < 1e-3
+
+
+def test_figure_6_fails_with_the_papers_set_because_the_gripper_opens_too_little():
+    frames = sequence.figure6(TCA.paper())
+    assert max(frame.gap for frame in frames) < presets.OBJECT.width
+    assert not any(frame.scene[grasp.HELD] for frame in frames)
+    # The stage stops where the jaws stand on the object.
+    top = presets.SITE.table - presets.OBJECT.height
+    assert sequence.place(frames[3].arm)[0][2] + frames[3].scene[grasp.STAGE] == pytest.approx(top, abs=1e-9)
+    assert (frames[-1].scene[grasp.X : grasp.YAW + 1] == frames[0].scene[grasp.X : grasp.YAW + 1]).all()
+
+
+def test_figure_6_is_written_as_computed(written, frames):
+    header, rows = read(written / "fig6.csv")
+    assert len(rows) == 2 * len(sequence.PANELS)
+    for row, frame in zip(rows, frames, strict=False):
+        line = dict(zip(header, row, strict=True))
+        assert (line["case"], line["panel"]) == (paper.HARDWARE.name, frame.label)
+        assert float(line["yaw_deg"]) == pytest.approx(frame.yaw, abs=1e-6)
+        assert float(line["gap_mm"]) == pytest.approx(1e3 * frame.gap, abs=1e-6)
+        assert float(line["object_x_mm"]) == pytest.approx(1e3 * frame.scene[grasp.X], abs=1e-6)
+        assert float(line["tip_z_mm"]) == pytest.approx(1e3 * frame.arm.tip_pose[2, 3], abs=1e-6)
+
+
+def test_the_table_says_that_figure_6_works_with_the_hardware_set_only(written):
+    lines = [line for line in (written / "agreement.md").read_text(encoding="utf-8").splitlines() if "| Fig. 6" in line]
+    assert len(lines) == 10
+    for line in lines:
+        expected = paper.HARDWARE.name in line or "one way only" in line
+        assert line.rstrip(" |").endswith("yes" if expected else "no"), line
+
+
+@pytest.mark.parametrize("gap", [0.0, 3e-3, 7e-3])
+def test_the_drawn_ring_has_its_length_and_gap(gap):
+    ring = presets.gripper()
+    left, right = (sequence.ring(ring, gap, side, 400) for side in (-1.0, 1.0))
+    assert np.linalg.norm(np.diff(left, axis=0), axis=1).sum() == pytest.approx(0.5 * ring.length, rel=1e-4)
+    assert right[-1, 0] - left[-1, 0] == pytest.approx(gap, abs=1e-9)

@@ -19,7 +19,7 @@ def straight_again(module):
     """Return K, xi* and the muscle's route in the frame that turns with the helix, where all of them are constant."""
     (muscle,) = module.muscles
     turning = 2.0 * np.pi * muscle.turns / module.length
-    reference = module.reference_strain + [0.0, 0.0, turning, 0.0, 0.0, 0.0]
+    reference = module.reference_strain + np.array([0.0, 0.0, turning, 0.0, 0.0, 0.0])
     return module.stiffness, reference, np.array([[muscle.offset, 0.0, 0.0, 0.0]]), turning
 
 

@@ -665,7 +665,8 @@ def run(out: Path, say: Callable[[str], object] = print) -> None:
         *(c for data in stiffnesses for c in claims_stiffness(data)),
         *(Claim(*row) for row in sequence.agreement(sequences, laws.values())),
     ]
-    text = report(comparisons, claims, weights(), all_gaps(bendings, stiffnesses))
+    missing = [*all_gaps(bendings, stiffnesses), *sequence.gaps(sequences)]
+    text = report(comparisons, claims, weights(), missing)
     write_agreement(comparisons, out / "agreement.csv")
     (out / "agreement.md").write_text(text, encoding="utf-8")
     say(text)
