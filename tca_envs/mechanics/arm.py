@@ -275,8 +275,10 @@ class Arm:
     def load(self, tip_force: ArrayLike = ZERO, tip_moment: ArrayLike = ZERO) -> Array:
         """Return the external load as the flat array of `collocation.LOAD` numbers that the kernels read."""
         load = self._load.copy()
-        load[0:3] = _vector("tip_force", tip_force)
-        load[3:6] = _vector("tip_moment", tip_moment)
+        if tip_force is not ZERO:
+            load[0:3] = check.array("tip_force", tip_force, (3,))
+        if tip_moment is not ZERO:
+            load[3:6] = check.array("tip_moment", tip_moment, (3,))
         return load
 
     def unloaded(self) -> tuple[Array, Array, Array, Array]:
@@ -459,10 +461,6 @@ def _half_product(q: Array, u: Array) -> Array:
     """Return (q o [0, u])/2, eq. (28)."""
     (w, x, y, z), (a, b, c) = q, u
     return 0.5 * np.array([-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a])
-
-
-def _vector(name: str, value: ArrayLike) -> ArrayLike:
-    return ZERO if value is ZERO else check.array(name, value, (3,))
 
 
 def _checked(grids: Sequence[Grid], modules: int) -> tuple[Grid, ...]:

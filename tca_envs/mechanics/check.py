@@ -1,5 +1,6 @@
 """Checks of arguments: each refuses with a message that names the argument, its value and what was expected."""
 
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,8 @@ def scalar(name: str, value: Any, low: float = -np.inf, high: float = np.inf, ab
 
 def array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
     """Return a float64 copy of `value`, finite and of `shape` (None: any size); ValueError otherwise."""
+    if type(value) is np.ndarray and value.dtype == np.float64 and value.shape == shape and isfinite(np.vdot(value, value)):
+        return value.copy()  # the usual case, and all that a fast solver has time for
     try:
         given = np.asarray(value)
     except ValueError:  # ragged
