@@ -15,9 +15,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 STAGE, X, Y, Z, YAW, HELD, ASTRIDE, ALONG, DROP, LOW = range(10)
-"""Columns of a scene: how far the stage is lowered [m]; the box's centre [m] and yaw [rad]; whether the jaws hold it, whether it
-stands between them (0 or 1); of a held box, its place along the jaws' width and below the jaws [m]; whether the jaws are lower
-than the top of a box on the table (0 or 1)."""
+"""Columns of a scene: how far the stage is lowered [m]; the box's centre [m] and yaw [rad]; whether the jaws hold it, whether
+it stands between them (0 or 1); of a held box, its place along the jaws' width and below the jaws [m]; whether the jaws are
+lower than the top of a box on the table (0 or 1)."""
 SCENE = 10
 
 
@@ -90,7 +90,7 @@ def half_extents(turn: Array, box: Box) -> tuple[Array, Array]:
 
 
 def largest_turn(gap: Array, box: Box) -> Array:
-    """Return the largest turn [rad] of a box between jaws `gap` (N,) [m] apart: width cos + length sin = gap; 0 for a pinched one."""
+    """Return the largest turn [rad] of a box between jaws `gap` (N,) [m] apart: width cos + length sin = gap; 0 if pinched."""
     diagonal = np.hypot(box.width, box.length)
     inside = np.clip(gap, box.width, diagonal)
     return np.where(gap >= diagonal, 0.5 * np.pi, np.arcsin(inside / diagonal) - np.arctan2(box.width, box.length))
@@ -101,9 +101,7 @@ def half_turn(angle: Array) -> Array:
     return (angle + 0.5 * np.pi) % np.pi - 0.5 * np.pi
 
 
-def step(
-    scene: Array, tool: Array, heading: Array, gap: Array, pinch: Array, lowering: Array, box: Box, site: Site
-) -> Array:
+def step(scene: Array, tool: Array, heading: Array, gap: Array, pinch: Array, lowering: Array, box: Box, site: Site) -> Array:
     """Move the stage and let jaws, box and table act on each other.
 
     The stage stops where the jaws or a held box meet the table, and where the jaws come down on a box that does not fit
