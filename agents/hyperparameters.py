@@ -96,7 +96,7 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
         },
         "dagger": {
             "env": "TCAPickAndPlaceDense-v0",
-            "steps": 600_000,
+            "steps": 300_000,
             "envs": 10,
             "done_steps": 40,
             "controller": "pick-and-place",
