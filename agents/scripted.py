@@ -4,6 +4,7 @@ They have the interface of a Stable-Baselines3 policy, `predict(observation) -> 
 runs a trained policy runs them too.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -32,7 +33,7 @@ MOST_YAW = np.radians(60.0)
 """Yaws are counted from here down a full turn: heating the helix turns one way, by at most 250 degrees or so."""
 
 
-class SteadyController:
+class SteadyController(ABC):
     """Plan the temperatures that put the tip on the goal, then drive each TCA there.
 
     The plan is Gauss-Newton on the arm's model with `tip_jacobian`, anew for every new goal. The drive is feed-forward
@@ -65,9 +66,9 @@ class SteadyController:
         temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * np.asarray(observation["observation"][:count], dtype=np.float64)
         return drive(temperature, self.target, self.heating).astype(np.float32), None
 
+    @abstractmethod
     def plan(self, goal: Array) -> Array:
         """Return the temperatures (n,) [degC] whose steady state is the goal, in the units of the task."""
-        raise NotImplementedError
 
 
 class ReachController(SteadyController):

@@ -1,11 +1,14 @@
 """What the README shows works."""
 
+import json
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from agents.scripted import CONTROLLERS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -50,3 +53,18 @@ def test_every_registered_environment_is_listed():
 def test_mechanics_knows_no_gymnasium():
     for path in (ROOT / "tca_envs" / "mechanics").glob("*.py"):
         assert "gymnasium" not in path.read_text(), path
+
+
+@pytest.mark.parametrize("report", sorted(ROOT.glob("agents/pretrained/*/report.json")), ids=lambda path: path.parent.name)
+def test_results_are_those_of_the_reports(report):
+    described = json.loads(report.read_text())
+    labels = {"random": "random", "scripted": f"scripted `{CONTROLLERS[described['task']].__name__}`"}
+    for name, result in described["held_out"].items():
+        low, high = (f"{100.0 * bound:.1f}" for bound in result["success_interval"])
+        time = result["time_to_success_s"]
+        row = (
+            f"| {labels.get(name, name if name == 'dagger' else name.upper()).replace('dagger', 'DAgger')} "
+            f"| {100.0 * result['success_rate']:.1f} % ({low}-{high} %) | {result['final_distance_mm']:.2f} mm "
+            f"| {'--' if time is None else f'{time:.2f} s'} | {result['energy_J']:.1f} J |"
+        )
+        assert row in README, row
