@@ -152,16 +152,17 @@ def step(scene: Array, tool: Array, heading: Array, gap: Array, pinch: Array, lo
     jaws = tool[:, 2] + stage
     low = (jaws > top) & ~blocked
 
-    # A box on the table between the jaws.
-    astride = ~held & low & ((scene[:, ASTRIDE] > 0.5) | (under & fits)) & (np.abs(along) <= 0.5 * site.jaw_width)
+    # A box on the table between the jaws: it was there, they come down around it, or they let it go there.
+    kept = held & firm
+    astride = np.where(held, ~firm, (scene[:, ASTRIDE] > 0.5) | (under & fits))
+    astride &= low & (np.abs(along) <= 0.5 * site.jaw_width)
     most = largest_turn(gap, box)
     turn = np.where(astride, np.clip(turn, -most, most), turn)
     play = np.maximum(0.5 * gap - half_extents(turn, box)[0], 0.0)
     across = np.where(astride, np.clip(across, -play, play), across)
     caught = astride & (gap <= box.width) & firm
 
-    # A held box: carried or lost.
-    kept = held & firm
+    # A held box is carried; a lost one falls.
     along = np.where(kept, scene[:, ALONG], along)
     across = np.where(kept, 0.0, across)
     turn = np.where(kept, 0.0, turn)
@@ -172,7 +173,7 @@ def step(scene: Array, tool: Array, heading: Array, gap: Array, pinch: Array, lo
     after[:, Z] = np.where(kept, np.minimum(jaws + scene[:, DROP], rest), rest)
     after[:, YAW] = np.where(moved, half_turn(heading + turn), scene[:, YAW])
     after[:, HELD] = kept | caught
-    after[:, ASTRIDE] = (astride & ~caught) | (held & ~kept & low)
+    after[:, ASTRIDE] = astride & ~caught
     after[:, ALONG] = np.where(kept | caught, along, 0.0)
     after[:, LOW] = low
     after[:, DROP] = np.where(kept, scene[:, DROP], np.where(caught, rest - jaws, 0.0))
