@@ -151,7 +151,10 @@ class Gripper:
         return result.reshape(given.shape)
 
     def _checked(self, temperature: ArrayLike) -> Array:
-        given = np.asarray(temperature)
+        try:
+            given = np.asarray(temperature)
+        except ValueError:  # ragged
+            given = np.empty(0, dtype=object)
         low, high = self.law.drive_range()
         if given.dtype.kind not in "iuf" or not ((given >= low) & (given <= high)).all():
             raise ValueError(f"temperature = {temperature!r}: expected numbers in [{low:g}, {high:g}] degC")
