@@ -105,8 +105,9 @@ def step(scene: Array, tool: Array, heading: Array, gap: Array, pinch: Array, lo
     """Move the stage and let jaws, box and table act on each other.
 
     The stage stops where the jaws or a held box meet the table, and where the jaws come down on a box that does not fit
-    between them. A box between closing jaws is pushed to their middle and turned into line; pinched firmly enough it is held
-    and moves with them, otherwise it falls straight down.
+    between them; it gives way where the arm sinks further. A box is between the jaws as long as its centre is within their
+    width. Closing jaws push it to their middle and turn it into line; pinched firmly enough it is held and moves with them,
+    otherwise it falls straight down.
 
     Parameters
     ----------
