@@ -103,7 +103,7 @@ class Gripper:
         force = self.tension(temperature)
         angle = pi - 0.5 * self.length * self.offset / self.bending_stiffness * force
         half = 0.5 * self.length * (1.0 - force / self.axial_stiffness)
-        return np.maximum(2.0 * half * np.sin(angle) / angle, 0.0)
+        return np.maximum(2.0 * half * np.sinc(angle / pi), 0.0)
 
     def half(self) -> Arm:
         """Return one half as an arm: from the mount, z along the ring, x towards its centre, the jaw at the tip."""
