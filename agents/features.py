@@ -6,6 +6,8 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
+from tca_envs.tasks import pick_and_place as layout
+
 
 class PickAndPlaceFeatures(BaseFeaturesExtractor):
     """The observation of TCAPickAndPlace and differences that decide what to do next.
@@ -27,13 +29,15 @@ class PickAndPlaceFeatures(BaseFeaturesExtractor):
     def forward(self, observation: dict[str, Any]) -> torch.Tensor:
         """Return the features (N, k)."""
         seen, achieved, desired = (observation[key] for key in ("observation", "achieved_goal", "desired_goal"))
-        c, s = seen[:, 13], seen[:, 14]
+        c, s = seen[:, layout.TOOL_COS], seen[:, layout.TOOL_SIN]
+        c2, s2 = seen[:, layout.OBJECT_COS2], seen[:, layout.OBJECT_SIN2]
         cosine, sine = c * c - s * s, 2.0 * c * s
-        turn = (cosine * seen[:, 21] + sine * seen[:, 22], cosine * seen[:, 22] - sine * seen[:, 21])
-        x, y, _ = (seen[:, 18:21] - seen[:, 10:13]).T
+        turn = (cosine * c2 + sine * s2, cosine * s2 - sine * c2)
+        way = seen[:, layout.OBJECT] - seen[:, layout.TOOL]
+        x, y = way[:, 0], way[:, 1]
         away = torch.cat(
             [
-                seen[:, 18:21] - seen[:, 10:13],
+                way,
                 torch.stack([c * x + s * y, c * y - s * x], dim=1),
                 desired[:, :3] - achieved[:, :3],
             ],

@@ -16,9 +16,9 @@ from tca_envs import presets
 from tca_envs.mechanics import Arm, Equilibrium, grasp, thermal
 from tca_envs.mechanics.rotation import yaw_angle
 from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT, Heater
+from tca_envs.tasks import pick_and_place as layout
+from tca_envs.tasks import twist_align
 from tca_envs.tasks.core import STEP_S
-from tca_envs.tasks.pick_and_place import FULL_FORCE
-from tca_envs.tasks.twist_align import SUCCESS_CM, SUCCESS_DEG
 
 Array = NDArray[np.float64]
 
@@ -26,8 +26,8 @@ Aim = Callable[[Equilibrium], tuple[Array, Array]]
 """Equilibrium -> what is missing to the goal (k,) [m] and the derivative of what is there in the temperatures (k, n) [m/K]."""
 
 CLOSE_ENOUGH = 5e-5
-"""Distance of the planned tip from the goal [m] at which planning ends: a twentieth of what the task asks."""
-METRES_PER_RADIAN = SUCCESS_CM / 100.0 / np.radians(SUCCESS_DEG)
+"""Distance of the planned tip from the goal [m] at which planning ends: a twentieth of what Reach asks, less of the others'."""
+METRES_PER_RADIAN = twist_align.SUCCESS_CM / 100.0 / np.radians(twist_align.SUCCESS_DEG)
 """Weight of yaw errors in plans: a tolerance of yaw counts like one of position."""
 MOST_YAW = np.radians(60.0)
 """Yaws are counted from here down a full turn: heating the helix turns one way, by at most 250 degrees or so."""
@@ -211,8 +211,8 @@ class Sight:
     """From 0 (up) to 1 (down)."""
     gap: float
     held: bool
-    between: bool
-    """Whether the jaws are around the object, holding or not."""
+    touched: bool
+    """Whether the gripper touches or surrounds the object."""
     low: bool
     """Whether the jaws are below the object's top."""
     object: Array
@@ -230,32 +230,41 @@ class Sight:
         return float(np.linalg.norm(self.object[:2] - self.tool[:2])) < NEAR and self.turn < NEAR_YAW
 
     @property
+    def between(self) -> bool:
+        """Whether the object stands between the jaws."""
+        return self.low and self.touched and self._offsets()[1] <= 0.5 * presets.SITE.jaw_width
+
+    @property
     def fits(self) -> bool:
         """Whether the object as it lies to the jaws fits between them."""
-        x, y = self.object[:2] - self.tool[:2]
-        across, along = abs(np.cos(self.yaw) * x + np.sin(self.yaw) * y), abs(np.cos(self.yaw) * y - np.sin(self.yaw) * x)
+        across, along = self._offsets()
         reach = float(grasp.half_extents(np.array(self.turn), presets.OBJECT)[0])
-        return bool(2.0 * (reach + across) + MARGIN < self.gap and along < ALONG)
+        return 2.0 * (reach + across) + MARGIN < self.gap and along < ALONG
+
+    def _offsets(self) -> tuple[float, float]:
+        """Return how far the object is from the tool [m], across the jaws and along their width."""
+        (x, y), c, s = self.object[:2] - self.tool[:2], np.cos(self.yaw), np.sin(self.yaw)
+        return float(abs(c * x + s * y)), float(abs(c * y - s * x))
 
     @classmethod
     def of(cls, observation: dict[str, NDArray[Any]]) -> "Sight":
         """Return what `observation` says."""
         seen = np.asarray(observation["observation"], dtype=np.float64)
-        place, tool = seen[18:21] / 100.0, seen[10:13] / 100.0
-        force = np.array(FULL_FORCE * seen[17])
+        place, tool = seen[layout.OBJECT] / 100.0, seen[layout.TOOL] / 100.0
+        force = np.array(layout.FULL_FORCE * seen[layout.FORCE])
         held = bool(grasp.holds(force, presets.OBJECT, presets.SITE))
         low = bool(tool[2] > place[2] - 0.5 * presets.OBJECT.height)
         return cls(
-            temperature=AMBIENT + (SOFT_LIMIT - AMBIENT) * seen[:5],
+            temperature=AMBIENT + (SOFT_LIMIT - AMBIENT) * seen[layout.TEMPERATURES],
             tool=tool,
-            yaw=float(np.arctan2(seen[14], seen[13])),
-            stage=float(seen[15]),
-            gap=float(seen[16]) / 100.0,
+            yaw=float(np.arctan2(seen[layout.TOOL_SIN], seen[layout.TOOL_COS])),
+            stage=float(seen[layout.TRAVEL]),
+            gap=float(seen[layout.OPENING]) / 100.0,
             held=held,
-            between=low and observation["achieved_goal"][3] < 0.5,
+            touched=bool(observation["achieved_goal"][3] < 0.5),
             low=low,
             object=place,
-            object_yaw=0.5 * float(np.arctan2(seen[22], seen[21])),
+            object_yaw=0.5 * float(np.arctan2(seen[layout.OBJECT_SIN2], seen[layout.OBJECT_COS2])),
             target=np.asarray(observation["desired_goal"][:2], dtype=np.float64) / 100.0,
         )
 

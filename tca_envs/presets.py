@@ -6,7 +6,10 @@ that add up to the arm's measured 6 g.
 
 from math import pi
 
-from tca_envs.mechanics import TCA, Arm, Grid, Gripper, Module, Muscle, Payload
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tca_envs.mechanics import TCA, Arm, Grid, Gripper, Module, Muscle, Payload, check
 from tca_envs.mechanics.grasp import Box, Site
 
 YOUNGS_MODULUS = 0.125e6
@@ -86,17 +89,18 @@ def gripper(tca: TCA | None = None) -> Gripper:
     return Gripper(GRIPPER_LENGTH, GRIPPER_STIFFNESS, axial, GRIPPER_OFFSET, tca or TCA())
 
 
-def with_object(along: float = 0.0, drop: float = 0.0) -> Payload:
+def with_object(place: ArrayLike = (0.0, 0.0, JAW_DEPTH)) -> Payload:
     """Return the gripper with the object in its jaws as a payload of the whole arm.
 
     Parameters
     ----------
-    along, drop : float
-        Place of the object's centre along the jaws' width and below them [m].
+    place : (3,) array
+        The object's centre in the frame of the twisting module's end [m].
     """
     mass = GRIPPER_MASS + OBJECT.mass
-    depth = (GRIPPER_MASS * GRIPPER_CENTRE[2] + OBJECT.mass * (JAW_DEPTH + drop)) / mass
-    return Payload(mass, (0.0, OBJECT.mass / mass * along, depth))
+    moment = GRIPPER_MASS * np.array(GRIPPER_CENTRE) + OBJECT.mass * check.array("place", place, (3,))
+    x, y, z = (moment / mass).tolist()
+    return Payload(mass, (x, y, z))
 
 
 def whole_arm(tca: TCA | None = None, payload: Payload | None = None) -> Arm:

@@ -14,11 +14,13 @@ from tca_envs.mechanics import check
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-STAGE, X, Y, Z, YAW, HELD, ASTRIDE, ALONG, DROP, LOW = range(10)
+STAGE, X, Y, Z, YAW, HELD, ASTRIDE, TOUCHED, ALONG, DROP, LOW = range(11)
 """Columns of a scene: how far the stage is lowered [m]; the box's centre [m] and yaw [rad]; whether the jaws hold it,
-whether it stands between them (0 or 1); of a held box, its place along the jaws' width and below the jaws [m]; whether the
-jaws are lower than the top of a box on the table (0 or 1)."""
-SCENE = 10
+whether it stands between them, whether they touch it or surround it in any way (0 or 1); of a held box, its place along the
+jaws' width and below the jaws [m]; whether the jaws are lower than the top of a box on the table (0 or 1)."""
+SCENE = 11
+CONTACT = 1e-6
+"""Jaws nearer to the top of a box than this stand on it [m]."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,11 @@ def largest_turn(gap: Array, box: Box) -> Array:
     return np.where(gap >= diagonal, 0.5 * np.pi, np.arcsin(inside / diagonal) - np.arctan2(box.width, box.length))
 
 
+def between_jaws(poses: Array, depth: float) -> Array:
+    """Return the points between the jaws (..., 3) [m] of a gripper whose mount has `poses` (..., 4, 4): `depth` below it."""
+    return np.asarray(poses[..., :3, 3] + depth * poses[..., :3, 2])
+
+
 def half_turn(angle: Array) -> Array:
     """Return angles [rad] modulo 180 degrees, in [-pi/2, pi/2)."""
     return (angle + 0.5 * np.pi) % np.pi - 0.5 * np.pi
@@ -142,8 +149,9 @@ def step(scene: Array, tool: Array, heading: Array, gap: Array, pinch: Array, lo
 
     # The stage and its stops.
     above = ~held & (scene[:, LOW] < 0.5)
-    under = above & (np.abs(along) < 0.5 * site.jaw_width + extent)
-    under &= np.abs(across) < 0.5 * gap + site.jaw_thickness + reach
+    met = np.abs(along) < 0.5 * site.jaw_width + extent
+    met &= np.abs(across) < 0.5 * gap + site.jaw_thickness + reach
+    under = above & met
     fits = np.abs(across) + reach <= 0.5 * gap
     stop = site.table - tool[:, 2]
     stop = np.where(held, np.minimum(stop, rest - scene[:, DROP] - tool[:, 2]), stop)
@@ -175,6 +183,7 @@ def step(scene: Array, tool: Array, heading: Array, gap: Array, pinch: Array, lo
     after[:, YAW] = np.where(moved, half_turn(heading + turn), scene[:, YAW])
     after[:, HELD] = kept | caught
     after[:, ASTRIDE] = astride & ~caught
+    after[:, TOUCHED] = kept | caught | (met & (jaws > top - CONTACT))
     after[:, ALONG] = np.where(kept | caught, along, 0.0)
     after[:, LOW] = low
     after[:, DROP] = np.where(kept, scene[:, DROP], np.where(caught, rest - jaws, 0.0))

@@ -97,8 +97,7 @@ class Rig:
             heating = step < SUBSTEPS
             self.temperature = self.temperature + change if heating else self.temperature
             held = self.scene[0, grasp.HELD] > 0.5
-            payload = presets.with_object(self.scene[0, grasp.ALONG], self.scene[0, grasp.DROP]) if held else None
-            arm = self._arm(payload).equilibrium(self.temperature[:4], start=self.arm)
+            arm = self._arm(self._payload() if held else None).equilibrium(self.temperature[:4], start=self.arm)
             self.converged &= arm.converged
             self.arm = arm if arm.converged else self.arm
             tool, heading = place(arm)
@@ -108,6 +107,11 @@ class Rig:
                 np.array([0.0 if heating else lowered / SUBSTEPS]), presets.OBJECT, presets.SITE,
             )  # fmt: skip
         self.temperature = temperature.astype(np.float64)
+
+    def _payload(self) -> Payload:
+        """Return the gripper with the object where it is."""
+        away = self.scene[0, grasp.X : grasp.Z + 1] - self.arm.tip_pose[:3, 3] - [0.0, 0.0, self.scene[0, grasp.STAGE]]
+        return presets.with_object(away @ self.arm.tip_pose[:3, :3])
 
     def _pinch(self) -> Array:
         """Return the force with which each jaw would press on the object between them (1,) [N]."""
@@ -124,8 +128,7 @@ class Rig:
 
 def place(arm: Equilibrium) -> tuple[Array, float]:
     """Return the point between the jaws (3,) [m], with the stage up, and the direction in which they open [rad]."""
-    r = arm.tip_pose
-    return r[:3, 3] + presets.JAW_DEPTH * r[:3, 2], float(yaw_angle(r))
+    return grasp.between_jaws(arm.tip_pose, presets.JAW_DEPTH), float(yaw_angle(arm.tip_pose))
 
 
 def turns(law: TCA, temperature: Array) -> Array:

@@ -26,6 +26,9 @@ BOX_CM = 10.0
 """No coordinate of tool or object can be larger."""
 FULL_FORCE = 0.05
 """Unit of the observed pinch force [N]."""
+TEMPERATURES, POWERS, TOOL, TOOL_COS, TOOL_SIN = slice(0, 5), slice(5, 10), slice(10, 13), 13, 14
+TRAVEL, OPENING, FORCE, OBJECT, OBJECT_COS2, OBJECT_SIN2 = 15, 16, 17, slice(18, 21), 21, 22
+"""Places in `observation`."""
 
 
 class PickAndPlace(Task):
@@ -45,8 +48,8 @@ class PickAndPlace(Task):
 
     The arm is quasi-static: it is in equilibrium at every step, while the temperatures follow the heating powers with a time
     constant of 1.8 s. Not modelled: contact between arm and table beyond a stop of the stage, jaws that push an object which
-    is not between them, impact, tilting and rolling of the object, the tilt of the jaws in contacts, the millimetre by which
-    the open ring is higher.
+    is not between them, impact, tilting and rolling of the object (a held one hangs upright), the tilt of the jaws in
+    contacts, the millimetre by which the jaws of the open ring hang lower.
 
     ## Action Space
 
@@ -59,7 +62,8 @@ class PickAndPlace(Task):
     | 4 | heating power of the gripper's TCA | 0 | 2.25 | W |
     | 5 | speed of the stage, positive down | -10 | 10 | mm/s |
 
-    A cut-off in the heaters lowers the power so that no TCA passes 158 degC. The stage travels 15 mm.
+    A cut-off in the heaters lowers the power so that no TCA passes 158 degC. The stage travels 15 mm; where the arm sinks onto
+    table or object it gives way.
 
     ## Observation Space
 
@@ -77,7 +81,7 @@ class PickAndPlace(Task):
     | | 18..20 | object position x, y, z (its centre) | -10 | 10 | cm |
     | | 21, 22 | cosine and sine of twice the object's yaw | -1 | 1 | 1 |
     | `achieved_goal` | 0..2 | object position x, y, z | -10 | 10 | cm |
-    | | 3 | 1 if it rests on the table and the gripper is clear of it, else 0 | 0 | 1 | 1 |
+    | | 3 | 1 if it rests on the table and the gripper neither touches nor surrounds it, else 0 | 0 | 1 | 1 |
     | `desired_goal` | 0..2 | target position x, y, z | -10 | 10 | cm |
     | | 3 | 1 | 0 | 1 | 1 |
 
@@ -166,7 +170,9 @@ class PickAndPlace(Task):
         record.scene[:] = np.where(solved(report)[:, np.newaxis], scene, record.scene)
         record.payload[:] = core.rest.payload
         for lane in np.flatnonzero(record.scene[:, grasp.HELD]):
-            hanging = presets.with_object(record.scene[lane, grasp.ALONG], record.scene[lane, grasp.DROP])
+            away = record.scene[lane, grasp.X : grasp.Z + 1] - record.tip[lane, :3, 3]
+            away[2] -= record.scene[lane, grasp.STAGE]
+            hanging = presets.with_object(away @ record.tip[lane, :3, :3])
             record.payload[lane] = (hanging.mass, *hanging.centre)
         return report
 
@@ -177,8 +183,7 @@ class PickAndPlace(Task):
     def achieved(self, record: Record) -> Array:
         """Return what is compared with the goal (N, 4): object position [cm] and whether it lies there free."""
         scene = record.scene
-        free = (scene[:, grasp.HELD] < 0.5) & (scene[:, grasp.ASTRIDE] < 0.5)
-        return np.column_stack([100.0 * scene[:, grasp.X : grasp.Z + 1], free])
+        return np.column_stack([100.0 * scene[:, grasp.X : grasp.Z + 1], scene[:, grasp.TOUCHED] < 0.5])
 
     def observe(self, core: Core) -> Array:
         """Return what a controller measures (N, 23)."""
@@ -223,7 +228,7 @@ class PickAndPlace(Task):
 
 def tool(record: Record) -> Array:
     """Return the points between the jaws (N, 3) with the stage up [m]."""
-    return record.tip[:, :3, 3] + presets.JAW_DEPTH * record.tip[:, :3, 2]
+    return grasp.between_jaws(record.tip, presets.JAW_DEPTH)
 
 
 def heading(record: Record) -> Array:

@@ -80,7 +80,7 @@ class Task(ABC):
 def held_out(temperature: Array) -> bool:
     """Return whether goals at `temperature` (n,) [degC] are held out: one cell in five, spread evenly over the space."""
     cells = np.floor((temperature - AMBIENT) / CELL_K).astype(int)
-    return bool((cells * np.arange(1, cells.size + 1)).sum() % 5 == 0)
+    return bool((cells * (np.arange(cells.size) % 4 + 1)).sum() % 5 == 0)
 
 
 def heat(core: Core) -> Array:

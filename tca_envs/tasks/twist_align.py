@@ -56,7 +56,8 @@ class TwistAlign(Task):
     | | 11, 12 | cosine and sine of the tip's yaw | -1 | 1 | 1 |
     | `achieved_goal` | 0..2 | tip position x, y, z | -8 | 8 | cm |
     | | 3, 4 | cosine and sine of the tip's yaw | -1 | 1 | 1 |
-    | `desired_goal` | 0..4 | the same of the goal | | | |
+    | `desired_goal` | 0..2 | goal position x, y, z | -8 | 8 | cm |
+    | | 3, 4 | cosine and sine of the goal's yaw | -1 | 1 | 1 |
 
     ## Rewards
 
