@@ -147,7 +147,7 @@ def test_an_object_in_the_jaws_hangs_at_its_place():
     empty, full = presets.whole_arm(), presets.whole_arm(payload=presets.with_object())
     cold = np.full(4, 25.0)
     assert full.equilibrium(cold).tip_pose[2, 3] > empty.equilibrium(cold).tip_pose[2, 3] + 1e-4
-    held = presets.with_object(along=2e-3, drop=1e-3)
+    held = presets.with_object((0.0, 2e-3, presets.JAW_DEPTH + 1e-3))
     assert held.mass == pytest.approx(2.4e-3)
     moment = presets.GRIPPER_MASS * np.array(presets.GRIPPER_CENTRE) + 1.5e-3 * np.array([0.0, 2e-3, presets.JAW_DEPTH + 1e-3])
     np.testing.assert_allclose(held.mass * np.array(held.centre), moment)
