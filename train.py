@@ -52,6 +52,8 @@ def main(arguments: list[str] | None = None) -> int:
         options.seed = description.get("seed", options.seed)
     task = task or "reach"
     algorithm = algorithm or DEFAULT_ALGORITHM[task]
+    if algorithm not in HYPERPARAMETERS[task]:
+        fail(f"--algo {algorithm}: not for the task {task!r}, whose algorithms are {', '.join(HYPERPARAMETERS[task])}")
     settings = dict(HYPERPARAMETERS[task][algorithm])
     import torch
 
@@ -140,7 +142,7 @@ def read_description(folder: Path) -> dict[str, Any]:
         fail(f"{folder}: expected the folder of a run, with policy.zip and policy.json ({error})")
     if not isinstance(description, dict):
         fail(f"{path}: expected an object with task and algo")
-    if description.get("task") not in HYPERPARAMETERS or description.get("algo") not in ALGORITHMS:
+    if description.get("algo") not in HYPERPARAMETERS.get(str(description.get("task")), {}):
         fail(
             f"{path}: task {description.get('task')!r} with {description.get('algo')!r} is unknown; the tasks are "
             f"{', '.join(HYPERPARAMETERS)}, the algorithms {', '.join(ALGORITHMS)}"

@@ -61,13 +61,22 @@ class DAgger(PPO):
         As of Stable-Baselines3's `PPO`; `n_steps` are the steps of each environment in a round, `n_epochs` the passes
         over the record after it.
     controller : str
-        Key of `agents.scripted.CONTROLLERS`.
+        Key of `agents.scripted.CONTROLLERS`; only a policy that learns no more can do without.
+
+    Raises
+    ------
+    ValueError
+        If there is no such controller, or none to learn from.
     """
 
     def __init__(self, policy: Any, env: Any, controller: str | None = None, **options: Any) -> None:
+        if controller is not None and controller not in CONTROLLERS:
+            raise ValueError(f"controller = {controller!r}: expected one of {', '.join(map(repr, CONTROLLERS))}")
         self.controller = controller
         self.record: list[tuple[Observations, NDArray[np.float32]]] = []
-        made = {"activation_fn": torch.nn.ReLU, "features_extractor_class": PickAndPlaceFeatures}
+        made: dict[str, Any] = {"activation_fn": torch.nn.ReLU}
+        if controller == "pick-and-place":
+            made["features_extractor_class"] = PickAndPlaceFeatures
         options["policy_kwargs"] = {**made, **(options.get("policy_kwargs") or {})}
         super().__init__(policy, env, **options)
 
@@ -95,20 +104,22 @@ class DAgger(PPO):
         total_timesteps, callbacks = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        assert self.env is not None and self.controller is not None
+        if self.controller is None:
+            raise ValueError(f"controller = None: expected one of {', '.join(map(repr, CONTROLLERS))} to learn from")
+        assert self.env is not None
         experts = [CONTROLLERS[self.controller]() for _ in range(self.env.num_envs)]
         callbacks.on_training_start(locals(), globals())
-        observation = self.env.reset()
+        observation: Any = self._last_obs
         going_on = True
         while going_on and self.num_timesteps < total_timesteps:
             by_expert = self.num_timesteps < EXPERT_STEPS
             for _ in range(self.n_steps):
-                assert isinstance(observation, dict)
                 lanes = [{key: value[i] for key, value in observation.items()} for i in range(len(experts))]
                 wanted = np.array([expert.predict(lane)[0] for expert, lane in zip(experts, lanes, strict=True)])
                 self.record.append(({key: value.copy() for key, value in observation.items()}, wanted))
                 action = wanted if by_expert else self.predict(observation, deterministic=True)[0]
                 observation, _, _, _ = self.env.step(action)
+                self._last_obs = observation
                 self.num_timesteps += self.env.num_envs
                 going_on = callbacks.on_step()
                 if not going_on or self.num_timesteps >= total_timesteps:

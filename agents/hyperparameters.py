@@ -1,4 +1,4 @@
-"""Training settings per task and algorithm: the default algorithms' are tuned for two CPU cores, PPO's are a start."""
+"""Training settings per task and algorithm: each task's default algorithm is tuned for two CPU cores, others are a start."""
 
 from typing import Any
 

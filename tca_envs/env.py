@@ -34,9 +34,9 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
     """
 
     def __init__(self, task: str = "reach", reward: str = "sparse", split: str = "train") -> None:
-        if task not in TASKS:
+        if not isinstance(task, str) or task not in TASKS:
             raise ValueError(f"task = {task!r}: expected one of {', '.join(map(repr, TASKS))}")
-        if reward not in REWARDS:
+        if not isinstance(reward, str) or reward not in REWARDS:
             raise ValueError(f"reward = {reward!r}: expected one of {', '.join(map(repr, REWARDS))}")
         self.metadata = {"render_modes": []}
         self.reward = reward

@@ -115,3 +115,17 @@ def test_a_saved_policy_acts_alike_and_leaves_the_record_behind(learner, tmp_pat
     learner.save_replay_buffer(tmp_path / "record.pkl")
     again.load_replay_buffer(tmp_path / "record.pkl")
     assert len(again.record) == 40
+
+
+def test_a_controller_is_asked_for():
+    env = DummyVecEnv([lambda: gym.make("TCAReach-v0")])
+    with pytest.raises(ValueError, match="controller = 'juggle': expected one of 'reach', "):
+        DAgger("MultiInputPolicy", env, controller="juggle", n_steps=2, batch_size=2)
+    with pytest.raises(ValueError, match="controller = None: expected one of 'reach', "):
+        DAgger("MultiInputPolicy", env, n_steps=2, batch_size=2).learn(2)
+
+
+def test_other_controllers_can_be_imitated():
+    env = DummyVecEnv([lambda: gym.make("TCAReach-v0")])
+    model = DAgger("MultiInputPolicy", env, controller="reach", n_steps=20, batch_size=20, n_epochs=1)
+    assert len(model.learn(20).record) == 20

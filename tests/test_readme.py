@@ -55,6 +55,10 @@ def test_mechanics_knows_no_gymnasium():
         assert "gymnasium" not in path.read_text(), path
 
 
+def test_every_task_has_a_report():
+    assert {path.parent.name for path in ROOT.glob("agents/pretrained/*/report.json")} == set(CONTROLLERS)
+
+
 @pytest.mark.parametrize("report", sorted(ROOT.glob("agents/pretrained/*/report.json")), ids=lambda path: path.parent.name)
 def test_results_are_those_of_the_reports(report):
     described = json.loads(report.read_text())

@@ -143,6 +143,7 @@ def test_ctrl_c_saves_what_there_is(tmp_path):
     [
         (["--task", "juggle"], "--task juggle: unknown; the tasks are reach, twist-align, pick-and-place"),
         (["--algo", "dqn"], "--algo dqn: unknown; the algorithms are sac, ppo, dagger"),
+        (["--algo", "dagger"], "--algo dagger: not for the task 'reach', whose algorithms are sac, ppo"),
         (["--steps", "0"], "--steps 0: expected a positive integer"),
         (["--episodes", "-3"], "--episodes -3: expected a positive integer"),
         (["--seed", "-1"], "--seed -1: expected an integer of at least 0"),

@@ -216,8 +216,8 @@ class Arm:
     grids : sequence of Grid, optional
         Discretisation, one for each module; by default `default_grid`.
     tolerance : float
-        Newton stops when `Equilibrium.residual` is below it. Convergence is quadratic, so the last step usually goes far
-        beyond: with 1e-6 the tip is solved to nanometres.
+        Newton stops when `Equilibrium.residual` is below it. With 1e-6 the tip of the bending module is solved to some
+        nanometres.
 
     Raises
     ------
@@ -348,6 +348,7 @@ class Arm:
             message=self._messages[int(rung)],
             length=self.length,
             load=load,
+            known=(from_drive, from_load),
             sample=state.sample,
             differentiate=state.differentiate,
             nodes=(self.model, strain),
@@ -371,9 +372,7 @@ class Arm:
                 f"start has {start.tensions.size} muscles and length {start.length:g} m: expected an equilibrium of this "
                 f"arm, with {len(self.muscles)} and {self.length:g} m"
             )
-        # A failed solve holds the shape of its own start, so that is where the substeps begin.
-        held = getattr(start.sample, "__self__", start.sample)
-        from_drive, from_load = getattr(held, "drive", start.drive), getattr(held, "load", start.load)
+        from_drive, from_load = start.known
         if start.nodes is not None and start.nodes[0] is self.model:
             strain = start.nodes[1].copy()
         else:

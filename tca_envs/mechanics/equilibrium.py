@@ -48,6 +48,8 @@ class Equilibrium:
     message: str
     length: float = field(repr=False)
     load: Array = field(repr=False)
+    known: tuple[Array, Array] = field(repr=False)
+    """Drive and load at which this shape is in equilibrium: where none was found, not those asked but the start's."""
     sample: Callable[[Array], tuple[Array, Array]] = field(repr=False)
     """Arc positions (k,) -> poses (k, 4, 4), strains (k, 6)."""
     differentiate: Callable[[], Array] = field(repr=False)

@@ -107,7 +107,8 @@ class Gripper:
 
     def half(self) -> Arm:
         """Return one half as an arm: from the mount, z along the ring, x towards its centre, the jaw at the tip."""
-        shear = self.axial_stiffness / 3.0  # G = E/3; it enters only where an object is pinched
+        # G = E/3; shear enters only where an object is pinched, bending and torsion out of the plane never.
+        shear = self.axial_stiffness / 3.0
         bending = self.bending_stiffness
         stiffness = np.array([bending, bending, bending, shear, shear, self.axial_stiffness])
         reference = np.array([0.0, 1.0 / self.radius, 0.0, 0.0, 0.0, 1.0])

@@ -451,12 +451,10 @@ def tip_jacobian(problem: Problem, unknowns: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Sampler:
-    """Poses and strains along an equilibrium at a drive and a load."""
+    """Poses and strains along an equilibrium."""
 
     arm: Arm
     pieces: tuple[OdeSolution | None, ...]
-    drive: Array
-    load: Array
 
     def __call__(self, s: Array) -> tuple[Array, Array]:
         """Return poses (k, 4, 4) and strains (k, 6) at arc positions (k,) [m]; at a joint, those beyond it."""
@@ -496,7 +494,8 @@ def _result(problem: Problem, solved: Problem, unknowns: Array, report: Report) 
         drive=problem.drive,
         length=problem.arm.length,
         load=problem.load,
-        sample=Sampler(problem.arm, trajectory.pieces, solved.drive, solved.load),
+        known=(solved.drive, solved.load),
+        sample=Sampler(problem.arm, trajectory.pieces),
         differentiate=partial(tip_jacobian, solved, unknowns),
         **report,
     )

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tca_envs import presets
 from tca_envs.mechanics import TCA, Arm, Equilibrium, Payload
+from tca_envs.mechanics.thermal import AMBIENT as ROOM
 from tca_envs.study import output, sequence
 
 if TYPE_CHECKING:
@@ -74,8 +75,6 @@ STIFFNESS_TEMPERATURES = (75.0, 100.0, 125.0, 150.0)
 """Fig. 5 [degC]."""
 PASSIVE = 0
 """Index of TCA 1, which stays at room temperature in Fig. 4."""
-ROOM = 25.0
-"""[degC]."""
 SMALLEST_ANGLE = 1.0
 """[deg]: a ratio to a smaller bend angle says nothing."""
 

@@ -19,6 +19,8 @@ from scipy.optimize import brentq
 from tca_envs import presets
 from tca_envs.mechanics import TCA, Arm, Equilibrium, Gripper, Payload, grasp
 from tca_envs.mechanics.rotation import yaw_angle
+from tca_envs.mechanics.thermal import AMBIENT as COLD
+from tca_envs.mechanics.thermal import SOFT_LIMIT
 from tca_envs.study import output
 
 if TYPE_CHECKING:
@@ -27,17 +29,14 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-COLD, OPEN, BENT = 25.0, 147.0, 110.0
-"""Temperatures [degC] of cold TCAs, of the open gripper and of the TCA at +x in (g)."""
-HOTTEST = 150.0
-"""[degC]."""
+OPEN, BENT = 147.0, 110.0
+"""Temperatures [degC] of the open gripper and of the TCA at +x in (g)."""
 OBJECT_YAW = -60.0
 """Of the object [deg]."""
 LOWERED = 10e-3
 """[m] (paper, Fig. 6: the object is 10 mm under the gripper)."""
 SUBSTEPS = 10
 """Of a change of temperatures or of the stage."""
-PANELS = ("start", "twist", "open", "lower, close", "lift", "untwist", "bend, open")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +75,7 @@ class Rig:
         self.law = law
         self.gripper = presets.gripper(law)
         self.temperature = np.full(5, COLD)
-        self.grid = np.arange(COLD, HOTTEST + 1.0)
+        self.grid = np.arange(COLD, SOFT_LIMIT + 1.0)
         self.pinch = self.gripper.pinch(self.grid, presets.OBJECT.width)
         self.converged = True
         self.scene = np.zeros((1, grasp.SCENE))
@@ -90,8 +89,9 @@ class Rig:
             self.arms[payload] = presets.whole_arm(self.law, payload)
         return self.arms[payload]
 
-    def move(self, temperature: Array, lowered: float = 0.0) -> None:
-        """Go to temperatures (5,) [degC] and then move the stage by `lowered` [m], in substeps."""
+    def move(self, bending: float = COLD, helix: float = COLD, jaws: float = COLD, lowered: float = 0.0) -> None:
+        """Heat the TCA at +x, the helical one and the gripper's [degC], then move the stage by `lowered` [m], in substeps."""
+        temperature = np.array([bending, COLD, COLD, helix, jaws])
         change = (temperature - self.temperature) / SUBSTEPS
         for step in range(2 * SUBSTEPS):
             heating = step < SUBSTEPS
@@ -100,13 +100,13 @@ class Rig:
             arm = self._arm(self._payload() if held else None).equilibrium(self.temperature[:4], start=self.arm)
             self.converged &= arm.converged
             self.arm = arm if arm.converged else self.arm
-            tool, heading = place(arm)
+            tool, heading = place(self.arm)
             self.scene = grasp.step(
                 self.scene, tool[np.newaxis], np.array([heading]), self.gripper.gap(self.temperature[4:]),
                 self._pinch(),
                 np.array([0.0 if heating else lowered / SUBSTEPS]), presets.OBJECT, presets.SITE,
             )  # fmt: skip
-        self.temperature = temperature.astype(np.float64)
+        self.temperature = temperature
 
     def _payload(self) -> Payload:
         """Return the gripper with the object where it is."""
@@ -123,7 +123,8 @@ class Rig:
         gap = float(self.gripper.gap(self.temperature[4]))
         pinch = float(self._pinch()[0]) if between else 0.0
         opening = max(gap, presets.OBJECT.width) if between else gap
-        return Frame(label, self.temperature.copy(), self.scene[0].copy(), self.arm, opening, pinch, self.converged)
+        converged, self.converged = self.converged, True
+        return Frame(label, self.temperature.copy(), self.scene[0].copy(), self.arm, opening, pinch, converged)
 
 
 def place(arm: Equilibrium) -> tuple[Array, float]:
@@ -143,27 +144,23 @@ def turns(law: TCA, temperature: Array) -> Array:
 def figure6(law: TCA) -> list[Frame]:
     """Compute the frames of Fig. 6; where the helix cannot turn as far as the object lies, it turns as far as it can."""
     rig = Rig(law)
-    grid = np.linspace(COLD, HOTTEST, 26)
+    grid = np.linspace(COLD, SOFT_LIMIT, 26)
     twisted = float(np.interp(-OBJECT_YAW, np.maximum.accumulate(-turns(law, grid)), grid))
-    steps = (
-        ((COLD, COLD, COLD, COLD, COLD), 0.0),
-        ((COLD, COLD, COLD, twisted, COLD), 0.0),
-        ((COLD, COLD, COLD, twisted, OPEN), 0.0),
-        ((COLD, COLD, COLD, twisted, OPEN), LOWERED),
-        ((COLD, COLD, COLD, twisted, COLD), -LOWERED),
-        ((COLD, COLD, COLD, COLD, COLD), 0.0),
-        ((BENT, COLD, COLD, COLD, COLD), 0.0),
-    )
-    frames: list[Frame] = []
-    for label, (temperature, lowered) in zip(PANELS, steps, strict=True):
-        if label == "lift":  # the gripper closes first, and is shown so
-            rig.move(np.array(temperature))
-            frames[-1] = rig.frame(PANELS[3])
-        rig.move(np.array(temperature), lowered)
-        if label == PANELS[-1]:
-            rig.move(np.array([*temperature[:4], OPEN]))
-        frames.append(rig.frame(label))
-    return frames
+    start = rig.frame("start")
+    rig.move(helix=twisted)
+    twist = rig.frame("twist")
+    rig.move(helix=twisted, jaws=OPEN)
+    opened = rig.frame("open")
+    rig.move(helix=twisted, jaws=OPEN, lowered=LOWERED)
+    rig.move(helix=twisted)
+    closed = rig.frame("lower, close")
+    rig.move(helix=twisted, lowered=-LOWERED)
+    lifted = rig.frame("lift")
+    rig.move()
+    untwisted = rig.frame("untwist")
+    rig.move(bending=BENT)
+    rig.move(bending=BENT, jaws=OPEN)
+    return [start, twist, opened, closed, lifted, untwisted, rig.frame("bend, open")]
 
 
 def write6(sequences: dict[str, list[Frame]], path: Path) -> None:
@@ -198,7 +195,8 @@ def draw6(sequences: dict[str, list[Frame]], path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    columns, rows, wide, high, side = len(PANELS), len(sequences), 1.75, 4.7, 4.1  # panels and 3D views [inch]
+    columns, rows = len(next(iter(sequences.values()))), len(sequences)
+    wide, high, side = 1.75, 4.7, 4.1  # panels and 3D views [inch]
     figure = Figure(figsize=(wide * columns + 0.3, high * rows + 0.35))
     for row, (case, frames) in enumerate(sequences.items()):
         bottom = 0.35 + high * (rows - 1 - row)
@@ -298,9 +296,12 @@ def agreement(sequences: dict[str, list[Frame]], laws: Iterable[TCA]) -> list[tu
     """Return what Fig. 6 shows, case, what the model says and whether it holds."""
     rows = []
     for (case, frames), law in zip(sequences.items(), laws, strict=True):
-        yaws = turns(law, np.linspace(40.0, HOTTEST, 23))
-        one_way = bool((np.diff(yaws) < 0.0).all())
-        found = f"from 40 to {HOTTEST:g} °C by {yaws[-1] - yaws[0]:.0f}°"
+        grid = np.arange(COLD, SOFT_LIMIT + 2.5, 2.5)
+        yaws = turns(law, grid)
+        back = grid[1:][np.diff(yaws) >= 0.0]
+        one_way = back.size == 0
+        found = f"from {COLD:g} to {SOFT_LIMIT:g} °C by {yaws[-1] - yaws[0]:.0f}°"
+        found += "" if one_way else f", the other way up to {back.max():g} °C"
         rows.append(("Fig. 6: the twisting module turns the gripper, one way only", case, found, one_way))
         aligned = frames[1]
         found = f"yaw {aligned.yaw:.0f}° for an object at {OBJECT_YAW:.0f}°"

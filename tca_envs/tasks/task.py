@@ -36,7 +36,7 @@ class Task(ABC):
     observation_space: spaces.Box
 
     def __init__(self, split: str) -> None:
-        if split not in SPLITS:
+        if not isinstance(split, str) or split not in SPLITS:
             raise ValueError(f"split = {split!r}: expected one of {', '.join(map(repr, SPLITS))}")
         self.split = split
 
