@@ -77,10 +77,17 @@ def test_resume_keeps_the_seed(trained):
     assert json.loads((folder / "policy.json").read_text())["seed"] == 3
 
 
+def run_quickly(*arguments):
+    """Run with one episode for each point of the learning curve."""
+    quickly = "import sys, train; train.CURVE_EPISODES = 1; sys.exit(train.main(sys.argv[1:]))"
+    command = [sys.executable, "-c", quickly, *map(str, arguments), "--episodes", "1"]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+
 def test_ppo_trains_and_goes_on_without_a_replay_buffer(tmp_path):
     folder = tmp_path / "ppo"
     for arguments in (["--algo", "ppo", "--out", folder], ["--resume", folder]):
-        done = run(*arguments, "--steps", 2048, "--episodes", 1)
+        done = run_quickly(*arguments, "--steps", 2048)
         assert done.returncode == 0, done.stderr
     with (folder / "curve.csv").open() as file:
         assert [int(float(row["steps"])) for row in csv.DictReader(file)][-1] == 4096
@@ -88,10 +95,8 @@ def test_ppo_trains_and_goes_on_without_a_replay_buffer(tmp_path):
 
 def test_dagger_imitates_the_controller_and_goes_on_with_its_record(tmp_path):
     folder = tmp_path / "dagger"
-    quickly = "import sys, train; train.CURVE_EPISODES = 1; sys.exit(train.main(sys.argv[1:]))"
-    for start, steps in ((["--task", "pick-and-place", "--out"], "2000"), (["--resume"], "1000")):
-        command = [sys.executable, "-c", quickly, *start, str(folder), "--steps", steps, "--episodes", "1"]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    for arguments in (["--task", "pick-and-place", "--out", folder, "--steps", 2000], ["--resume", folder, "--steps", 1000]):
+        done = run_quickly(*arguments)
         assert done.returncode == 0, done.stderr
     assert json.loads((folder / "policy.json").read_text())["algo"] == "dagger"
     with (folder / "replay_buffer.pkl").open("rb") as file:

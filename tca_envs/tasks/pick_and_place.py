@@ -1,6 +1,7 @@
 """PickAndPlace: grasp an object on the table and put it down elsewhere."""
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -131,8 +132,7 @@ class PickAndPlace(Task):
     def __init__(self, split: str) -> None:
         super().__init__(split)
         self.gripper = presets.gripper()
-        self._pinch_at = np.arange(AMBIENT, HARD_LIMIT + 1.0)
-        self._pinch = self.gripper.pinch(self._pinch_at, presets.OBJECT.width)
+        self._pinch = pinch_table()
 
     def core(self, lanes: int) -> Core:
         """Return `lanes` lanes of the whole arm; the gripper's TCA is heated, too."""
@@ -178,7 +178,7 @@ class PickAndPlace(Task):
 
     def pinch(self, record: Record) -> Array:
         """Return the force (N,) with which each jaw would press on the object between them [N]."""
-        return np.interp(record.temperature[:, 4], self._pinch_at, self._pinch)
+        return np.interp(record.temperature[:, 4], PINCH_AT, self._pinch)
 
     def achieved(self, record: Record) -> Array:
         """Return what is compared with the goal (N, 4): object position [cm] and whether it lies there free."""
@@ -224,6 +224,18 @@ class PickAndPlace(Task):
     def measures(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mapping[str, Array]:
         """Return what `info` reports of goals, by key."""
         return {"distance_mm": 10.0 * self.distance(achieved, desired)}
+
+
+PINCH_AT = np.arange(AMBIENT, HARD_LIMIT + 1.0)
+"""[degC]: the pinch force is interpolated between these, within 0.3 mN."""
+
+
+@cache
+def pinch_table() -> Array:
+    """Return the pinch force on the object at PINCH_AT [N]; it takes a second, and every environment asks."""
+    table = presets.gripper().pinch(PINCH_AT, presets.OBJECT.width)
+    table.setflags(write=False)
+    return table
 
 
 def tool(record: Record) -> Array:
