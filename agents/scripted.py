@@ -32,6 +32,23 @@ METRES_PER_RADIAN = twist_align.SUCCESS_CM / 100.0 / np.radians(twist_align.SUCC
 MOST_YAW = np.radians(60.0)
 """Yaws are counted from here down a full turn: heating the helix turns one way, by at most 250 degrees or so."""
 
+OPEN, WIDE = 150.0, 4.5e-3
+"""Temperature of the open gripper [degC], and the gap from which on it counts as open [m]."""
+NEAR, NEAR_YAW = 3e-3, np.radians(20.0)
+"""Errors of the tool [m], [rad] at which the gripper opens."""
+MARGIN, ALONG = 4e-4, 2.5e-3
+"""Spare gap of the jaws, and the largest offset of the object along their width [m]."""
+GRASP_DEPTH = 1.5e-3
+"""The jaws close when they are no higher above the object's centre [m]."""
+OVER_TARGET, PLACED = 1.5e-3, 2.8e-3
+"""Errors of the object [m] at which it is released, and at which it is left."""
+UNTWISTED = np.radians(15.0)
+"""Yaw of the tool [rad] that counts as the original one."""
+SAME_PLACE = 2e-4
+"""An object that moved less [m], turned less [rad], needs no new plan."""
+LEAST_TURN = np.radians(5.0)
+"""Of the yaws that fit, the first below this one needs the least heat [rad]."""
+
 
 class SteadyController(ABC):
     """Plan the temperatures that put the tip on the goal, then drive each TCA there.
@@ -180,24 +197,6 @@ class PickAndPlaceController:
             temperatures = plan(arm, tool_at(goal[:2], turn), starts)
             self.plans[name] = goal, temperatures
         return temperatures
-
-
-OPEN, WIDE = 150.0, 4.5e-3
-"""Temperature of the open gripper [degC], and the gap from which on it counts as open [m]."""
-NEAR, NEAR_YAW = 3e-3, np.radians(20.0)
-"""Errors of the tool [m], [rad] at which the gripper opens."""
-MARGIN, ALONG = 4e-4, 2.5e-3
-"""Spare gap of the jaws, and the largest offset of the object along their width [m]."""
-GRASP_DEPTH = 1.5e-3
-"""The jaws close when they are no higher above the object's centre [m]."""
-OVER_TARGET, PLACED = 1.5e-3, 2.8e-3
-"""Errors of the object [m] at which it is released, and at which it is left."""
-UNTWISTED = np.radians(15.0)
-"""Yaw of the tool [rad] that counts as the original one."""
-SAME_PLACE = 2e-4
-"""An object that moved less [m], turned less [rad], needs no new plan."""
-LEAST_TURN = np.radians(5.0)
-"""Of the yaws that fit, the first below this one needs the least heat [rad]."""
 
 
 @dataclass(frozen=True)
