@@ -16,7 +16,7 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.S)
 
 
 def test_there_are_examples():
-    assert len(EXAMPLES) == 2
+    assert len(EXAMPLES) == 3
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
@@ -26,6 +26,8 @@ def test_examples_run(example):
     assert done.stdout
     if "ReachController" in example:
         assert done.stdout.startswith("True")
+    if "policy.zip" in example:
+        assert done.stdout.startswith("success 100.0 %")
 
 
 def test_files_that_it_names_exist():

@@ -148,7 +148,10 @@ class Gripper:
                 return 2.0 * float(jaw.tip_pose[2, 3]) - width
 
             guess = stiffness * (width - free[i])
-            result[i] = root_scalar(excess, x0=guess, x1=0.9 * guess + 1e-6, xtol=1e-9).root
+            found = root_scalar(excess, x0=guess, x1=0.9 * guess + 1e-6, xtol=1e-9)
+            if not found.converged:
+                raise RuntimeError(f"no pinch force found at {start.drive[0]:g} degC and a width of {width:g} m: {found.flag}")
+            result[i] = found.root
         return result.reshape(given.shape)
 
     def _checked(self, temperature: ArrayLike) -> Array:
