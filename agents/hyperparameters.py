@@ -13,19 +13,24 @@ ALGORITHMS = ("sac", "ppo", "dagger")
 
 DEFAULT_ALGORITHM = {"reach": "sac", "twist-align": "sac", "pick-and-place": "dagger"}
 
+SAC: dict[str, Any] = {
+    "envs": 4,
+    "learning_rate": 1e-3,
+    "batch_size": 256,
+    "gamma": 0.95,
+    "learning_starts": 1_000,
+    "train_freq": 1,
+    "gradient_steps": 1,
+}
+"""What SAC has in common on all tasks."""
+
 HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
     "reach": {
         "sac": {
+            **SAC,
             "env": "TCAReachDense-v0",
             "steps": 60_000,
-            "envs": 4,
             "policy_kwargs": {"net_arch": [64, 64]},
-            "learning_rate": 1e-3,
-            "batch_size": 256,
-            "gamma": 0.95,
-            "learning_starts": 1_000,
-            "train_freq": 1,
-            "gradient_steps": 1,
             "buffer_size": 100_000,
         },
         "ppo": {
@@ -43,16 +48,10 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
     },
     "twist-align": {
         "sac": {
+            **SAC,
             "env": "TCATwistAlignDense-v0",
             "steps": 150_000,
-            "envs": 4,
             "policy_kwargs": {"net_arch": [128, 128]},
-            "learning_rate": 1e-3,
-            "batch_size": 256,
-            "gamma": 0.95,
-            "learning_starts": 1_000,
-            "train_freq": 1,
-            "gradient_steps": 1,
             "buffer_size": 200_000,
         },
         "ppo": {
@@ -70,16 +69,12 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
     },
     "pick-and-place": {
         "sac": {
+            **SAC,
             "env": "TCAPickAndPlaceDense-v0",
             "steps": 300_000,
-            "envs": 4,
             "policy_kwargs": {"net_arch": [256, 256]},
-            "learning_rate": 1e-3,
-            "batch_size": 256,
             "gamma": 0.99,
             "learning_starts": 10_000,
-            "train_freq": 1,
-            "gradient_steps": 1,
             "buffer_size": 300_000,
         },
         "ppo": {

@@ -133,8 +133,7 @@ class PickAndPlaceController:
     def __init__(self) -> None:
         self.arm = presets.whole_arm()
         self.carrying = presets.whole_arm(payload=presets.with_object())
-        self.gripper = presets.gripper()
-        self.heating = Heater().scaled(np.append(self.arm.rest_lengths, self.gripper.rest_length))
+        self.heating = Heater().scaled(np.append(self.arm.rest_lengths, presets.gripper().rest_length))
         self.plans: dict[str, tuple[Array, Array]] = {}
 
     def predict(

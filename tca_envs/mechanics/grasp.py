@@ -103,6 +103,13 @@ def between_jaws(poses: Array, depth: float) -> Array:
     return np.asarray(poses[..., :3, 3] + depth * poses[..., :3, 2])
 
 
+def in_mount(scene: Array, poses: Array) -> Array:
+    """Return the centres of boxes (..., 3) [m] in the frames of the gripper mounts, `poses` (..., 4, 4) with the stage up."""
+    away = scene[..., X : Z + 1] - poses[..., :3, 3]
+    away[..., 2] -= scene[..., STAGE]
+    return np.asarray(np.einsum("...ij,...i->...j", poses[..., :3, :3], away))
+
+
 def half_turn(angle: Array) -> Array:
     """Return angles [rad] modulo 180 degrees, in [-pi/2, pi/2)."""
     return (angle + 0.5 * np.pi) % np.pi - 0.5 * np.pi

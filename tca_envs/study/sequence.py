@@ -97,7 +97,8 @@ class Rig:
             heating = step < SUBSTEPS
             self.temperature = self.temperature + change if heating else self.temperature
             held = self.scene[0, grasp.HELD] > 0.5
-            arm = self._arm(self._payload() if held else None).equilibrium(self.temperature[:4], start=self.arm)
+            payload = presets.with_object(grasp.in_mount(self.scene[0], self.arm.tip_pose)) if held else None
+            arm = self._arm(payload).equilibrium(self.temperature[:4], start=self.arm)
             self.converged &= arm.converged
             self.arm = arm if arm.converged else self.arm
             tool, heading = place(self.arm)
@@ -107,11 +108,6 @@ class Rig:
                 np.array([0.0 if heating else lowered / SUBSTEPS]), presets.OBJECT, presets.SITE,
             )  # fmt: skip
         self.temperature = temperature
-
-    def _payload(self) -> Payload:
-        """Return the gripper with the object where it is."""
-        away = self.scene[0, grasp.X : grasp.Z + 1] - self.arm.tip_pose[:3, 3] - [0.0, 0.0, self.scene[0, grasp.STAGE]]
-        return presets.with_object(away @ self.arm.tip_pose[:3, :3])
 
     def _pinch(self) -> Array:
         """Return the force with which each jaw would press on the object between them (1,) [N]."""

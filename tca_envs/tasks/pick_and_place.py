@@ -170,9 +170,7 @@ class PickAndPlace(Task):
         record.scene[:] = np.where(solved(report)[:, np.newaxis], scene, record.scene)
         record.payload[:] = core.rest.payload
         for lane in np.flatnonzero(record.scene[:, grasp.HELD]):
-            away = record.scene[lane, grasp.X : grasp.Z + 1] - record.tip[lane, :3, 3]
-            away[2] -= record.scene[lane, grasp.STAGE]
-            hanging = presets.with_object(away @ record.tip[lane, :3, :3])
+            hanging = presets.with_object(grasp.in_mount(record.scene[lane], record.tip[lane]))
             record.payload[lane] = (hanging.mass, *hanging.centre)
         return report
 

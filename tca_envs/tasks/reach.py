@@ -8,9 +8,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from tca_envs import presets
-from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT, Heater
+from tca_envs.mechanics.thermal import Heater
 from tca_envs.tasks.core import Core, Record
-from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat
+from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat, steady_goals
 
 SUCCESS_CM = 0.1
 """A tip within 1 mm of the goal has reached it."""
@@ -94,16 +94,7 @@ class Reach(Task):
 
     def draw(self, core: Core, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
         """Return tips (count, 3) [cm] at steady temperatures of this task's split; there is no scene."""
-        goals = np.empty((count, 3))
-        for i in range(count):
-            settled = False
-            while not settled:
-                temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * rng.random(3)
-                if self.of_this_split(temperature):
-                    record, good = core.settle(temperature[np.newaxis])
-                    settled = bool(good[0])
-            goals[i] = self.achieved(record)[0]
-        return goals, np.empty((count, 0))
+        return steady_goals(self, core, rng, count), np.empty((count, 0))
 
     def achieved(self, record: Record) -> Array:
         """Return what is compared with the goal (N, 3): tip position [cm]."""

@@ -77,6 +77,23 @@ class Task(ABC):
         return held_out(temperature) == (self.split == "held-out")
 
 
+def steady_goals(task: Task, core: Core, rng: np.random.Generator, count: int) -> Array:
+    """Return what `count` arms achieve (count, k) in steady states of the task's split, drawn uniformly up to the soft limit.
+
+    Where the arm could end on several sides, other temperatures are drawn, see `Core.settle`.
+    """
+    goals = np.empty((count, core.record.goal.shape[1]))
+    for i in range(count):
+        settled = False
+        while not settled:
+            temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * rng.random(len(core.arm.muscles))
+            if task.of_this_split(temperature):
+                record, good = core.settle(temperature[np.newaxis])
+                settled = bool(good[0])
+        goals[i] = task.achieved(record)[0]
+    return goals
+
+
 def held_out(temperature: Array) -> bool:
     """Return whether goals at `temperature` (n,) [degC] are held out: one cell in five, spread evenly over the space."""
     cells = np.floor((temperature - AMBIENT) / CELL_K).astype(int)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from tca_envs import presets
 from tca_envs.mechanics.rotation import yaw
-from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT, Heater
+from tca_envs.mechanics.thermal import Heater
 from tca_envs.tasks.core import Core, Record
-from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat
+from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat, steady_goals
 
 SUCCESS_CM = 0.15
 """A tip within 1.5 mm of the goal is over it ..."""
@@ -106,16 +106,7 @@ class TwistAlign(Task):
 
     def draw(self, core: Core, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
         """Return tip positions [cm] and yaws (count, 5) at steady temperatures of this task's split; there is no scene."""
-        goals = np.empty((count, 5))
-        for i in range(count):
-            settled = False
-            while not settled:
-                temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * rng.random(4)
-                if self.of_this_split(temperature):
-                    record, good = core.settle(temperature[np.newaxis])
-                    settled = bool(good[0])
-            goals[i] = self.achieved(record)[0]
-        return goals, np.empty((count, 0))
+        return steady_goals(self, core, rng, count), np.empty((count, 0))
 
     def achieved(self, record: Record) -> Array:
         """Return what is compared with the goal (N, 5): tip position [cm], cosine and sine of its yaw."""
