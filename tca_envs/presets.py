@@ -112,7 +112,7 @@ def whole_arm(tca: TCA | None = None, payload: Payload | None = None) -> Arm:
     """
     modules = [bending_module(tca), twisting_module(tca)]
     hanging = payload or Payload(GRIPPER_MASS, GRIPPER_CENTRE)
-    return Arm(modules, GRAVITY, hanging, [Grid(1, 7), Grid(6, 4)], tolerance=1e-5)
+    return Arm(modules, GRAVITY, hanging, [Grid(1, 7), Grid(6, 4)], residual_tolerance=1e-5)
 
 
 def bending_arm(tca: TCA | None = None) -> Arm:
@@ -121,4 +121,4 @@ def bending_arm(tca: TCA | None = None) -> Arm:
     One element of 7 Gauss nodes: the tip lies within 1 um of that of a grid ten times finer at all temperatures up to the
     hard limit (tests/test_benchmark.py).
     """
-    return Arm([bending_module(tca)], GRAVITY, BELOW_BENDING, [Grid(1, 7)], tolerance=1e-6)
+    return Arm([bending_module(tca)], GRAVITY, BELOW_BENDING, [Grid(1, 7)], residual_tolerance=1e-6)

@@ -145,9 +145,10 @@ CASES: dict[tuple[Callable[..., Any], str], list[Any]] = {
         2,
         "x",
     ],
-    (arm, "tolerance"): [*NO_NUMBER, 0.0, -1e-9, 1e-13, 0.1],
+    (arm, "residual_tolerance"): [*NO_NUMBER, 0.0, -1e-9, 1e-13, 0.2],
     (equilibrium, "tip_force"): [*NO_VECTOR, None],
     (equilibrium, "tip_moment"): [*NO_VECTOR, None],
+    (equilibrium, "payload"): [1e-3, "x", (1e-3, (0.0, 0.0, 0.0)), Payload],
     (equilibrium, "drive"): [(), (0.1, 0.1), ((0.1,),), 0.1, (NAN,), (INF,), (-0.1,), None, "x", ("x",), {}],
     (heated, "drive"): [(-20.1,), (300.1,), (1e9,), (NAN,), (), (25.0, 25.0)],
     (equilibrium, "start"): [1.0, "x", np.eye(4), ARM],
@@ -235,7 +236,7 @@ def test_the_ends_of_the_ranges_are_accepted():
     assert result.poses([]).shape == (0, 4, 4)
     assert result.poses(0.045).shape == (1, 4, 4)
     assert result.centerline(np.int64(2)).shape == (2, 3)
-    assert arm(tolerance=1e-12, grids=[(1, np.int64(16))]).grids == (Grid(1, 16),)
+    assert arm(residual_tolerance=1e-12, grids=[(1, np.int64(16))]).grids == (Grid(1, 16),)
     assert module(length=np.float64(0.045), mass_per_length=0).mass_per_length == 0.0
 
 

@@ -99,7 +99,7 @@ def test_tip_jacobian(benchmark, arm):
 
 
 def test_the_presets_grid_is_accurate_to_a_micrometre(arm):
-    finer = Arm(arm.modules, arm.gravity, arm.payload, [Grid(10, arm.grids[0].nodes)], tolerance=1e-11)
+    finer = Arm(arm.modules, arm.gravity, arm.payload, [Grid(10, arm.grids[0].nodes)], residual_tolerance=1e-11)
     rng = np.random.default_rng(0)
     corners = itertools.product((25.0, 160.0), repeat=3)
     drives = [*rng.uniform(25.0, 160.0, (40, 3)), *map(np.array, corners)]
@@ -119,7 +119,7 @@ def test_the_whole_arms_grid_is_accurate_to_ten_micrometres(payload):
     """Against ten times as many elements, at random temperatures and in all corners up to the heaters' cut-off."""
     arm = presets.whole_arm(payload=payload)
     grids = [Grid(10 * grid.elements, grid.nodes) for grid in arm.grids]
-    finer = Arm(arm.modules, arm.gravity, arm.payload, grids, tolerance=1e-9)
+    finer = Arm(arm.modules, arm.gravity, arm.payload, grids, residual_tolerance=1e-9)
     rng = np.random.default_rng(0)
     drives = [*rng.uniform(25.0, CUT_OFF, (12, 4)), *map(np.array, itertools.product((25.0, CUT_OFF), repeat=4))]
     for drive in drives:

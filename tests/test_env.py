@@ -199,7 +199,7 @@ def test_info_says_the_same_as_the_observation(env):
         )
         assert info["is_success"] is (reward == 0.0)
         assert info["solver"]["converged"] is True
-        assert info["solver"]["residual"] < env.unwrapped.core.arm.tolerance
+        assert info["solver"]["residual"] < env.unwrapped.core.arm.residual_tolerance
     temperature = 25.0 + 125.0 * observation["observation"][:muscles].astype(float)
     assert info["cost"] == pytest.approx(np.maximum(temperature - SOFT_LIMIT, 0.0).sum(), abs=1e-3)
     assert info["cost"] > 0.0

@@ -52,10 +52,10 @@ def tendon(offset: float, angle: float = 0.0, turns: float = 0.0) -> Muscle:
     return Muscle(offset, angle, turns, Tendon())
 
 
-def paper_module(grids: list[Grid] | None = None, tolerance: float = 1e-9) -> Arm:
+def paper_module(grids: list[Grid] | None = None, residual_tolerance: float = 1e-9) -> Arm:
     """The paper's bending module with the rest of the arm below it: soft, heavy, strongly nonlinear."""
     module = Module.cylinder(L, 0.0045, E, E / 3.0, 3.9e-3, three(TCA()))
-    return Arm([module], (0.0, 0.0, G0), Payload(2.1e-3, (0.0, 0.0, 0.012)), grids, tolerance)
+    return Arm([module], (0.0, 0.0, G0), Payload(2.1e-3, (0.0, 0.0, 0.012)), grids, residual_tolerance)
 
 
 paper = cache(paper_module)
@@ -106,7 +106,7 @@ class Case(NamedTuple):
 def two_modules() -> Arm:
     bending = Module.cylinder(L, 0.0045, E, E / 3.0, 3.9e-3, three(TCA()))
     twisting = Module.cylinder(0.016, 0.0045, E, E / 3.0, 1.2e-3, [Muscle(0.0035, 0.0, 5.0, TCA())])
-    return Arm([bending, twisting], (0.0, 0.0, G0), Payload(2.4e-3, (0.001, 0.0, 0.01)), tolerance=1e-11)
+    return Arm([bending, twisting], (0.0, 0.0, G0), Payload(2.4e-3, (0.001, 0.0, 0.01)), residual_tolerance=1e-11)
 
 
 def ring() -> Module:
@@ -117,29 +117,29 @@ def ring() -> Module:
 
 
 CASES = {
-    "three TCAs, gravity, payload": lambda: Case(paper_module(tolerance=1e-11), (130.0, 60.0, 30.0)),
+    "three TCAs, gravity, payload": lambda: Case(paper_module(residual_tolerance=1e-11), (130.0, 60.0, 30.0)),
     "three springs": lambda: Case(
-        Arm([rod(three(Spring(50.0)))], tolerance=1e-12),
+        Arm([rod(three(Spring(50.0)))], residual_tolerance=1e-12),
         (0.042, 0.033, 0.035),
         (0.02, 0.01, -0.03),
         step=1e-6,
     ),
     "tendons, tip force": lambda: Case(
-        Arm([rod([tendon(0.004), tendon(0.003, 2.0, 0.6)], mass=2e-3)], (G0, 0.0, 0.0), tolerance=1e-12),
+        Arm([rod([tendon(0.004), tendon(0.003, 2.0, 0.6)], mass=2e-3)], (G0, 0.0, 0.0), residual_tolerance=1e-12),
         (0.3, 0.15),
         (0.02, -0.03, 0.05),
         step=1e-5,
     ),
     "two modules, one helical TCA": lambda: Case(two_modules(), (110.0, 40.0, 60.0, 120.0)),
     "out-of-plane tip moment": lambda: Case(
-        Arm([rod([tendon(0.004)])], tolerance=1e-12),
+        Arm([rod([tendon(0.004)])], residual_tolerance=1e-12),
         (0.3,),
         (0.0, 0.0, 0.02),
         (8e-4, 0.0, 4e-4),
         step=1e-5,
     ),
     "curved ring": lambda: Case(
-        Arm([ring()], (0.0, G0, 0.0), Payload(1.5e-3, (0.0, 0.001, 0.0)), tolerance=1e-12),
+        Arm([ring()], (0.0, G0, 0.0), Payload(1.5e-3, (0.0, 0.001, 0.0)), residual_tolerance=1e-12),
         (0.2,),
         (0.0, 0.01, 0.0),
         step=1e-5,
@@ -148,7 +148,7 @@ CASES = {
         Arm(
             [rod([tendon(0.004), tendon(0.004, 1.5)], 0.025), rod([tendon(0.003, 3.0)], 0.03, 1e-3)],
             (0.0, -G0, 0.0),
-            tolerance=1e-12,
+            residual_tolerance=1e-12,
         ),
         (0.4, 0.2, 0.3),
         (0.0, 0.01, 0.01),
@@ -173,7 +173,7 @@ def solved_finely(name: str) -> tuple[Case, Equilibrium]:
     case = CASES[name]()
     arm = case.arm
     grids = [Grid(4 * elements, nodes) for elements, nodes in arm.grids]
-    case = case._replace(arm=Arm(arm.modules, arm.gravity, arm.payload, grids, arm.tolerance))
+    case = case._replace(arm=Arm(arm.modules, arm.gravity, arm.payload, grids, arm.residual_tolerance))
     result = case.solve()
     assert result.converged, result.message
     return case, result
@@ -335,7 +335,7 @@ def test_a_tip_moment_closes_the_rod_to_a_circle():
 
 def test_a_curved_rod_stays_curved_without_load():
     module = replace(ring(), muscles=())
-    result = Arm([module], tolerance=1e-12).equilibrium([])
+    result = Arm([module], residual_tolerance=1e-12).equilibrium([])
     assert same_pose(result.tip_pose, expm(0.035 * twist(module.reference_strain)), 1e-8 * L, 1e-8)
     assert result.strain([0.01]) == pytest.approx(module.reference_strain[np.newaxis], abs=1e-9)
 
@@ -363,13 +363,13 @@ def test_the_lateral_stiffness_vanishes_at_the_critical_tip_weight():
     shear = 1.0 / GA - 1.0 / EA
     critical = (np.sqrt(1.0 + 4.0 * euler * shear) - 1.0) / (2.0 * shear)
     assert critical == pytest.approx(CRITICAL, abs=1e-9)
-    arm = Arm([rod()], tolerance=1e-12)
+    arm = Arm([rod()], residual_tolerance=1e-12)
     assert zero(lambda weight: lateral_stiffness(arm, weight), critical) == pytest.approx(critical, rel=1e-6)
 
 
 def test_the_lateral_stiffness_vanishes_at_greenhills_length():
     def standing(length: float) -> Arm:
-        return Arm([rod(length=length, mass=WEIGHT / G0 * length, rigid=True)], (0, 0, -G0), tolerance=1e-12)
+        return Arm([rod(length=length, mass=WEIGHT / G0 * length, rigid=True)], (0, 0, -G0), residual_tolerance=1e-12)
 
     critical = (7.83734744 * EI / WEIGHT) ** (1.0 / 3.0)
     assert critical == pytest.approx(0.077886787, abs=1e-7)
@@ -633,7 +633,7 @@ def test_the_default_grid_resolves_the_tip_to_a_millionth_of_the_length(name):
 def test_the_heavy_soft_module_is_solved_from_cold_at_any_temperature(drive):
     result = paper().equilibrium(drive)
     assert result.converged, result.message
-    assert result.residual < paper().tolerance
+    assert result.residual < paper().residual_tolerance
     assert (result.tensions > SLACK).all()
 
 
@@ -682,7 +682,7 @@ def test_across_a_fold_the_arm_comes_to_rest_at_the_same_place_on_every_grid(bef
 def test_a_full_range_jump_ends_at_an_equilibrium(before, after):
     result = paper().equilibrium(after, start=paper().equilibrium(before))
     assert result.converged, result.message
-    assert result.residual < paper().tolerance
+    assert result.residual < paper().residual_tolerance
     assert (result.tensions > SLACK).all()
     assert no_nan(result)
 
@@ -741,7 +741,7 @@ def loaded(
         G0 * hang,
         Payload(scale**2 * 1e-3, tuple(scale * 0.005 * pull)),
         [Grid(2, 8)],
-        tolerance=1e-11,
+        residual_tolerance=1e-11,
     )
     tension = [scale**2 * f for *_, f in layout]
     result = arm.equilibrium(tension, scale**2 * 0.03 * pull, scale**3 * 2e-4 * turn)
@@ -809,7 +809,7 @@ def cut_at(*ends: float) -> Arm:
         helix = tendon(0.003, 2.0 + 2.0 * np.pi * 0.8 * begin, 0.8 * (end - begin))  # goes on where it was cut
         modules.append(rod([tendon(0.004, 0.5), helix], (end - begin) * L, (end - begin) * 2e-3))
     payload = Payload(1e-3, (0.0, 0.0, 0.01))
-    return Arm(modules, (0.0, G0, 0.0), payload, [Grid(4, 8)] * len(modules), tolerance=1e-11)
+    return Arm(modules, (0.0, G0, 0.0), payload, [Grid(4, 8)] * len(modules), residual_tolerance=1e-11)
 
 
 @few

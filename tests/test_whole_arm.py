@@ -113,8 +113,8 @@ def test_turning_arm_and_temperatures_turns_the_answer():
         presets.TWISTING_LENGTH, presets.BODY_DIAMETER, presets.YOUNGS_MODULUS, presets.SHEAR_MODULUS, presets.TWISTING_MASS,
         [helix],
     )  # fmt: skip
-    turned = Arm([presets.bending_module(), twisting], presets.GRAVITY, arm.payload, arm.grids, tolerance=1e-9)
-    arm = Arm(arm.modules, arm.gravity, arm.payload, arm.grids, tolerance=1e-9)
+    turned = Arm([presets.bending_module(), twisting], presets.GRAVITY, arm.payload, arm.grids, residual_tolerance=1e-9)
+    arm = Arm(arm.modules, arm.gravity, arm.payload, arm.grids, residual_tolerance=1e-9)
     for a, b, c, d in ((110.0, 60.0, 40.0, 80.0), (25.0, 120.0, 25.0, 140.0)):
         first, second = arm.equilibrium([a, b, c, d]), turned.equilibrium([c, a, b, d])
         np.testing.assert_allclose(turn @ first.tip_pose[:3, 3], second.tip_pose[:3, 3], atol=1e-9)

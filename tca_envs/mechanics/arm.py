@@ -14,6 +14,7 @@ from tca_envs.mechanics.collocation import (
     FAILED,
     FALL,
     LOAD,
+    PAYLOAD_MASS,
     SUBSTEPS,
     WARM,
     Model,
@@ -215,7 +216,7 @@ class Arm:
         A rigid body that hangs from the tip.
     grids : sequence of Grid, optional
         Discretisation, one for each module; by default `default_grid`.
-    tolerance : float
+    residual_tolerance : float
         Newton stops when `Equilibrium.residual` is below it. With 1e-6 the tip of the bending module is solved to some
         nanometres.
 
@@ -231,7 +232,7 @@ class Arm:
         gravity: ArrayLike = ZERO,
         payload: Payload | None = None,
         grids: Sequence[Grid] | None = None,
-        tolerance: float = 1e-9,
+        residual_tolerance: float = 1e-9,
     ) -> None:
         try:
             self.modules = tuple(modules)
@@ -240,17 +241,15 @@ class Arm:
         if not self.modules or not all(isinstance(module, Module) for module in self.modules):
             raise ValueError(f"modules = {modules!r}: expected at least one Module and nothing else")
         self.gravity = check.array("gravity", gravity, (3,))
-        if payload is not None and not isinstance(payload, Payload):
-            raise ValueError(f"payload = {payload!r}: expected a Payload or None")
         self.payload = payload
         self.grids = tuple(default_grid(m) for m in self.modules) if grids is None else _checked(grids, len(self.modules))
-        self.tolerance = check.scalar("tolerance", tolerance, 1e-12, 1e-3)
+        self.residual_tolerance = check.scalar("residual_tolerance", residual_tolerance, 1e-12, 1e-1)
         self.length = sum(module.length for module in self.modules)
         self.muscles = tuple(muscle for module in self.modules for muscle in module.muscles)
-        self.model, self.node_arc = _compile(self.modules, self.grids, self.tolerance)
+        self.model, self.node_arc = _compile(self.modules, self.grids, self.residual_tolerance)
         ranges = [muscle.law.drive_range() for muscle in self.muscles]
         self._lowest, self._highest = [low for low, _ in ranges], [high for _, high in ranges]
-        found = f"converged below {self.tolerance:g}"
+        found = f"converged below {self.residual_tolerance:g}"
         self._messages = {
             WARM: found,
             SUBSTEPS: f"{found} in substeps of drive and load",
@@ -263,7 +262,7 @@ class Arm:
         self._load = np.zeros(LOAD)
         self._load[6:9] = self.gravity
         if payload is not None:
-            self._load[9:] = (payload.mass, *payload.centre)
+            self._load[PAYLOAD_MASS:] = _flat(payload)
         per_module = [grid.elements * grid.nodes for grid in self.grids]
         self._unloaded_strain = np.repeat(self.model.reference, per_module, axis=0)
 
@@ -272,9 +271,11 @@ class Arm:
         """Path lengths of the muscles in the unloaded arm (n,) [m]."""
         return self.model.rest_length.copy()
 
-    def load(self, tip_force: ArrayLike = ZERO, tip_moment: ArrayLike = ZERO) -> Array:
+    def load(self, tip_force: ArrayLike = ZERO, tip_moment: ArrayLike = ZERO, payload: Payload | None = None) -> Array:
         """Return the external load as the flat array of `collocation.LOAD` numbers that the kernels read."""
         load = self._load.copy()
+        if payload is not None:
+            load[PAYLOAD_MASS:] = _flat(payload)
         if tip_force is not ZERO:
             load[0:3] = check.array("tip_force", tip_force, (3,))
         if tip_moment is not ZERO:
@@ -291,6 +292,7 @@ class Arm:
         tip_force: ArrayLike = ZERO,
         tip_moment: ArrayLike = ZERO,
         start: Equilibrium | None = None,
+        payload: Payload | None = None,
     ) -> Equilibrium:
         """Find the equilibrium that continues `start`, or the unloaded arm.
 
@@ -302,6 +304,8 @@ class Arm:
             Load on the last centroid in the base frame [N], [N m].
         start : Equilibrium, optional
             An earlier equilibrium of this arm: a warm start.
+        payload : Payload, optional
+            What hangs from the tip instead of the arm's own payload.
 
         Returns
         -------
@@ -320,7 +324,7 @@ class Arm:
         `collocation`.
         """
         drive = self.checked_drive(drive)
-        load = self.load(tip_force, tip_moment)
+        load = self.load(tip_force, tip_moment, payload)
         if start is None:
             strain, tension, from_drive, from_load = self.unloaded()
         else:
@@ -454,6 +458,12 @@ def pose(quaternion: Array, position: Array) -> Array:
     )
     result[:3, 3] = position
     return result
+
+
+def _flat(payload: Payload) -> tuple[float, ...]:
+    if not isinstance(payload, Payload):
+        raise ValueError(f"payload = {payload!r}: expected a Payload or None")
+    return (payload.mass, *payload.centre)
 
 
 def _half_product(q: Array, u: Array) -> Array:

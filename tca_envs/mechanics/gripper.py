@@ -113,7 +113,7 @@ class Gripper:
         stiffness = np.array([bending, bending, bending, shear, shear, self.axial_stiffness])
         reference = np.array([0.0, 1.0 / self.radius, 0.0, 0.0, 0.0, 1.0])
         muscle = Muscle(self.offset, pi, 0.0, self.law)
-        return Arm([Module(0.5 * self.length, stiffness, 0.0, [muscle], reference)], tolerance=1e-10)
+        return Arm([Module(0.5 * self.length, stiffness, 0.0, [muscle], reference)], residual_tolerance=1e-10)
 
     def pinch(self, temperature: ArrayLike, width: float) -> Array:
         """Return the force of each jaw on an object [N] at temperatures (...) [degC]; 0 where the jaws are wider apart.

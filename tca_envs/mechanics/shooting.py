@@ -29,7 +29,7 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from tca_envs.mechanics import check, section
-from tca_envs.mechanics.arm import ZERO, Arm, Module, pose
+from tca_envs.mechanics.arm import ZERO, Arm, Module, Payload, pose
 from tca_envs.mechanics.equilibrium import Equilibrium
 from tca_envs.mechanics.muscle import TENDON, elongation
 
@@ -99,6 +99,7 @@ def equilibrium(
     tip_moment: ArrayLike = ZERO,
     start: Equilibrium | None = None,
     rtol: float = 1e-6,
+    payload: Payload | None = None,
 ) -> Equilibrium:
     """Find an equilibrium of an arm by the paper's shooting method.
 
@@ -115,6 +116,8 @@ def equilibrium(
         tensions are the first guess. By default the reference strain and no tension (tendons: their drive).
     rtol : float
         Relative tolerance of the integration, in [1e-12, 0.1]; the root finder's follows it.
+    payload : Payload, optional
+        What hangs from the tip instead of the arm's own payload.
 
     Returns
     -------
@@ -138,7 +141,7 @@ def equilibrium(
     if not isinstance(arm, Arm):
         raise ValueError(f"arm = {arm!r}: expected an Arm")
     rtol = check.scalar("rtol", rtol, 1e-12, 1e-1)
-    problem = Problem(arm, arm.checked_drive(drive), arm.load(tip_force, tip_moment), rtol)
+    problem = Problem(arm, arm.checked_drive(drive), arm.load(tip_force, tip_moment, payload), rtol)
     base = arm.modules[0].reference_strain
     if start is None:
         tendon = [muscle.law.kind == TENDON for muscle in arm.muscles]

@@ -1,0 +1,6 @@
+"""The methods on the speed-accuracy chart, one file each."""
+
+from tca_envs.study.method import Method
+from tca_envs.study.methods import collocation
+
+METHODS: tuple[Method, ...] = (collocation.METHOD,)
