@@ -205,9 +205,10 @@ def test_strain_series_report_what_they_do_not_find(strains):
 
 @pytest.mark.slow
 def test_strain_series_carry_payload_weight_and_a_second_helical_module(strains):
-    distance, turn = error(gvs.METHOD, 2, presets.whole_arm(), [110.0, 60.0, 40.0, 90.0])
-    assert distance < 1e-4
-    assert turn < 0.02
+    # The arm's own grid is good for 10 um.
+    distance, turn = error(gvs.METHOD, 3, presets.whole_arm(), [110.0, 60.0, 40.0, 90.0])
+    assert distance < 1.5e-5
+    assert turn < 0.01
 
 
 @pytest.mark.slow
