@@ -237,6 +237,32 @@ def integrals(c: Array, x: Array) -> Array:
     return np.asarray(np.linalg.solve(vandermonde.T, np.array(columns)).T, dtype=np.float64)
 
 
+@cache
+def interpolation(here: Grid, there: Grid) -> Array:
+    """Return the matrix (G', G) that takes values at the nodes of one grid of a module to those of another.
+
+    By the Lagrange polynomials of the element that a node lies in.
+    """
+    vandermonde = np.polynomial.legendre.legvander
+    x = ((np.arange(there.elements)[:, np.newaxis] + gauss(there.nodes)[2]) / there.elements * here.elements).ravel()
+    element = np.minimum(x.astype(int), here.elements - 1)
+    basis = vandermonde(2.0 * gauss(here.nodes)[2] - 1.0, here.nodes - 1)
+    weights = np.linalg.solve(basis.T, vandermonde(2.0 * (x - element) - 1.0, here.nodes - 1).T).T
+    result = np.zeros((len(x), here.elements, here.nodes))
+    result[np.arange(len(x)), element] = weights
+    return result.reshape(len(x), -1)
+
+
+def carried(here: Sequence[Grid], strain: Array, there: Sequence[Grid]) -> Array:
+    """Return strains (..., G, 6) at the nodes of an arm's grids `here` interpolated to those of other grids, (..., G', 6)."""
+    parts, first = [], 0
+    for old, new in zip(here, there, strict=True):
+        last = first + old.elements * old.nodes
+        parts.append(interpolation(old, new) @ strain[..., first:last, :])
+        first = last
+    return np.concatenate(parts, axis=-2)
+
+
 def default_grid(module: Module) -> Grid:
     """Return a grid that resolves a muscle-driven or moderately loaded module to below 1e-6 of its length.
 
@@ -432,10 +458,16 @@ class Arm:
                 f"arm, with {len(self.muscles)} and {self.length:g} m"
             )
         from_drive, from_load = start.known
-        if start.nodes is not None and start.nodes[0] is self.model:
-            strain = start.nodes[1].copy()
-        else:
+        if start.nodes is None:
             strain = start.strain(self.node_arc)
+        else:
+            model, nodes = start.nodes
+            if model is self.model:
+                strain = nodes.copy()
+            elif np.array_equal(model.length, self.model.length):
+                strain = carried([Grid(e, q) for e, q in zip(model.elements, model.nodes, strict=True)], nodes, self.grids)
+            else:
+                strain = start.strain(self.node_arc)
         return strain, start.tensions.copy(), from_drive.copy(), from_load.copy()
 
 

@@ -14,7 +14,6 @@ Everything is deterministic: costs are counted, not timed.
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from math import ceil
 from typing import NamedTuple
 
@@ -22,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tca_envs.mechanics import check
-from tca_envs.mechanics.arm import MAX_NODES, Arm, Grid, Module, gauss
+from tca_envs.mechanics.arm import MAX_NODES, Arm, Grid, Module, carried
 from tca_envs.mechanics.collocation import FAILED, LOAD, Model, solve_lanes
 
 Array = NDArray[np.float64]
@@ -174,11 +173,19 @@ def _cheapest(k: int, share: float, fine: Known, residual_tolerance: float) -> G
         parts = (fine.some(slice(FIRST)), fine.some(slice(FIRST, None)))
         return all(_error(grids, part, residual_tolerance) <= share for part in parts)
 
-    for elements in sorted(range(1, max(2 * few, best.elements) + 1), key=lambda number: abs(number - few)):
+    def improved(elements: int) -> bool:
+        nonlocal best
         grids = [Grid(elements, nodes) for nodes in range(FEWEST_NODES, MAX_NODES + 1)]
         cheaper = [grid for grid in grids if cost(module, grid) < cost(module, best)]
         first = bisect_left(cheaper, True, key=does)
         best = cheaper[first] if first < len(cheaper) else best
+        return first < len(cheaper)
+
+    improved(few)
+    for step in (1, -1):  # more elements, then fewer, as long as that is cheaper
+        elements = few + step
+        while elements >= 1 and improved(elements):
+            elements += step
     return best
 
 
@@ -190,12 +197,7 @@ def _error(grids: Sequence[Grid], fine: Known, residual_tolerance: float) -> flo
 
 def _carried(known: Known, arm: Arm, off: float = 0.0) -> Known:
     """Solve known states on another arm's grids, starting from their strains, reduced towards the unloaded ones by `off`."""
-    strain = np.empty((len(known.drive), len(arm.node_arc), 6))
-    g_to = g_from = 0
-    for here, there in zip(known.arm.grids, arm.grids, strict=True):
-        n_from, n_to = here.elements * here.nodes, there.elements * there.nodes
-        strain[:, g_to : g_to + n_to] = interpolation(here, there) @ known.strain[:, g_from : g_from + n_from]
-        g_to, g_from = g_to + n_to, g_from + n_from
+    strain = carried(known.arm.grids, known.strain, arm.grids)
     if off:
         strain -= off * (strain - arm.unloaded()[0])
     straight = arm.model._replace(ladder=False)
@@ -209,19 +211,3 @@ def _solve(
     tip, lengths, report = np.tile(np.eye(4), (len(drive), 1, 1)), np.empty_like(drive), np.empty((len(drive), 3))
     solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report)
     return Known(arm, drive, load, strain, tension, tip[:, :3, 3], report[:, 0] != FAILED)
-
-
-@cache
-def interpolation(here: Grid, there: Grid) -> Array:
-    """Return the matrix (G', G) that takes values at the nodes of one grid of a module to those of another.
-
-    By the Lagrange polynomials of the element that a node lies in.
-    """
-    vandermonde = np.polynomial.legendre.legvander
-    x = ((np.arange(there.elements)[:, np.newaxis] + gauss(there.nodes)[2]) / there.elements * here.elements).ravel()
-    element = np.minimum(x.astype(int), here.elements - 1)
-    basis = vandermonde(2.0 * gauss(here.nodes)[2] - 1.0, here.nodes - 1)
-    weights = np.linalg.solve(basis.T, vandermonde(2.0 * (x - element) - 1.0, here.nodes - 1).T).T
-    result = np.zeros((len(x), here.elements, here.nodes))
-    result[np.arange(len(x)), element] = weights
-    return result.reshape(len(x), -1)
