@@ -2,8 +2,9 @@
 
 from collections.abc import Callable
 from importlib.util import find_spec
+from itertools import pairwise
 from math import ceil, pi
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -72,10 +73,12 @@ def evenly(items: list[Case], count: int) -> list[Case]:
 def recorded(task: str, title: str, count: int) -> Scene:
     """Return steps of a task's episodes: half of them of its scripted controller, half of random actions."""
     if find_spec("agents") is None:
-        raise ModuleNotFoundError(f"scene {task} runs the scripted controllers of `agents`, which are in a checkout of tca_envs")
+        raise ModuleNotFoundError(
+            f"scene {task} runs the scripted controllers of `agents`, which are in a checkout of tca_envs"
+        )
     from agents.scripted import CONTROLLERS, RandomPolicy
 
-    env = gymnasium.make(IDS[task])
+    env: gymnasium.Env[Any, Any] = gymnasium.make(IDS[task])
     core = env.unwrapped.core  # type: ignore[attr-defined]
     arm, record = core.arm, core.record
 
@@ -84,7 +87,10 @@ def recorded(task: str, title: str, count: int) -> Scene:
         return State(arm, record.drive[0].copy(), payload=Payload(mass, (x, y, z)))
 
     cases: list[Case] = []
-    for policy, share in ((CONTROLLERS[task](), count - count // 2), (RandomPolicy(env.action_space.shape[0]), count // 2)):
+    for policy, share in (
+        (CONTROLLERS[task](), count - count // 2),
+        (RandomPolicy(len(env.action_space.sample())), count // 2),
+    ):
         steps: list[Case] = []
         for episode in range(max(2, ceil(share / STEPS_OF_AN_EPISODE))):
             observation, _ = env.reset(seed=episode)
@@ -176,7 +182,7 @@ def one_degree(count: int) -> Scene:
     half = round(SOFT_LIMIT - AMBIENT)
     phase = np.arange(2 * half + 1)[:, np.newaxis] + half // 2 * np.arange(len(arm.muscles))
     states = [State(arm, AMBIENT + row) for row in np.abs((phase + half) % (2 * half) - half).astype(float)]
-    steps = [Case(*pair) for pair in zip(states[:-1], states[1:], strict=True)]
+    steps = [Case(*pair) for pair in pairwise(states)]
     return Scene("one-degree", "steps of 1 °C: whole arm, all TCAs", arm, tuple(evenly(steps, count)))
 
 

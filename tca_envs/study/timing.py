@@ -16,7 +16,7 @@ from tca_envs.study.scenes import Case, Scene
 
 Array = NDArray[np.float64]
 
-REPEATS, REPEAT_S = 21, 0.02
+REPEATS, REPEAT_S = 21, 0.01
 """A solve is repeated until there are so many or until they have taken so long together [s]; it counts with the median."""
 OTHER_EQUILIBRIUM = 0.1
 """A tip farther than this from the reference, relative to the arm's length, belongs to another equilibrium."""
@@ -37,7 +37,7 @@ class Effort(NamedTuple):
     """Time [s] after which a method's finer settings are left out in a scene."""
 
 
-FULL = Effort(cases=200, budget=2.0, least=3, patience=90.0)
+FULL = Effort(cases=120, budget=3.0, least=3, patience=60.0)
 QUICK = Effort(cases=12, budget=0.2, least=1, patience=1.0)
 
 
@@ -135,6 +135,12 @@ def equilibrium(arm: Arm, state: State, start: Equilibrium | None = None) -> Equ
     return found
 
 
+def spread(count: int) -> list[int]:
+    """Return 0 to count - 1 in an order whose every beginning is spread evenly over them (van der Corput's)."""
+    digits = max(count - 1, 1).bit_length()
+    return [i for i in (int(f"{k:0{digits}b}"[::-1], 2) for k in range(2**digits)) if i < count]
+
+
 def label(setting: Any) -> str:
     """Return a setting as text."""
     return f"{setting:g}" if isinstance(setting, float) else str(setting)
@@ -218,9 +224,7 @@ def no_collection() -> Iterator[None]:
             gc.enable()
 
 
-def points(
-    scene: Scene, method: Method, referee: Referee, order: Sequence[int], effort: Effort, done: Callable[[], object]
-) -> list[Point]:
+def points(scene: Scene, method: Method, referee: Referee, effort: Effort, done: Callable[[], object]) -> list[Point]:
     """Measure a method on a scene.
 
     Parameters
@@ -231,8 +235,6 @@ def points(
         Which.
     referee : Referee
         Of the scene.
-    order : sequence of int
-        In which the cases come.
     effort : Effort
         How long to go on.
     done : callable
@@ -243,6 +245,7 @@ def points(
     list of Point
         One for every setting, from coarse to fine; where there is nothing to show, with a note that says why.
     """
+    order = spread(len(scene.cases))
     states = [state for case in scene.cases for state in case if state is not None]
     farthest = np.inf if method.reduced else OTHER_EQUILIBRIUM * scene.arm.length
     result: list[Point] = []
