@@ -10,7 +10,7 @@ import numpy as np
 
 from tca_envs.study import output
 from tca_envs.study.scenes import Scene
-from tca_envs.study.timing import Point
+from tca_envs.study.timing import NOT_INSTALLED, NOT_RUN, Point
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,8 +70,9 @@ def draw_overview(scenes: Sequence[Scene], measured: Sequence[Point], names: Seq
         axes.set_title(scene.title, fontsize=11)
         if axes is not panels[0]:
             axes.set_ylabel("")
+        tried = [p for p in group if p.note not in (NOT_INSTALLED, NOT_RUN)]
         axes.annotate(
-            absent(group, 66), (0.0, 0.0), xycoords="axes fraction", xytext=(0, -36), textcoords="offset points", va="top",
+            absent(tried, 66), (0.0, 0.0), xycoords="axes fraction", xytext=(0, -36), textcoords="offset points", va="top",
             fontsize=7, color="0.25",
         )  # fmt: skip
     everything = [p for group in groups for p in group]

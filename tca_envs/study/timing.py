@@ -23,6 +23,10 @@ OTHER_EQUILIBRIUM = 0.1
 SMALLEST_ERROR = 1e-13
 """Errors below this are raised to it [m]: a few units in the last place of the tip's coordinates."""
 
+FAILS, REFUSES = "fails on all cases", "cannot model this arm"
+NOT_INSTALLED, NOT_RUN = "not installed", "not run: the coarser settings took too long"
+"""Notes of points that have nothing to show."""
+
 
 class Effort(NamedTuple):
     """How much is measured."""
@@ -34,7 +38,7 @@ class Effort(NamedTuple):
     least: int
     """... unless it has fewer than this."""
     patience: float
-    """Time [s] after which a method's finer settings are left out in a scene."""
+    """Time [s] that a method has on a scene; then its finer settings are left out."""
 
 
 FULL = Effort(cases=120, budget=3.0, least=3, patience=60.0)
@@ -98,6 +102,8 @@ class Measured(NamedTuple):
     """(k, 3) [m]; nan where it failed."""
     error: Array
     """(k,) [m]; nan where it failed."""
+    spent: float
+    """Time for all this [s]."""
 
 
 class Referee:
@@ -142,8 +148,11 @@ def spread(count: int) -> list[int]:
 
 
 def label(setting: Any) -> str:
-    """Return a setting as text."""
-    return f"{setting:g}" if isinstance(setting, float) else str(setting)
+    """Return a setting as text, powers of ten as 1e-6."""
+    if not isinstance(setting, float) or 0.1 <= abs(setting) < 1e4:
+        return f"{setting:g}" if isinstance(setting, float) else str(setting)
+    mantissa, exponent = f"{setting:.5e}".split("e")
+    return f"{float(mantissa):g}e{int(exponent)}"
 
 
 def measure(
@@ -175,9 +184,6 @@ def measure(
     tips: list[Array] = []
     errors: list[float] = []
     spent = 0.0
-    if cases[order[0]].before is None:
-        # Compiles and loads what the state before does for a warm start.
-        solver.solve(cases[order[0]].state, solver.cold())
     for index in order:
         if spent > effort.budget and len(times) >= effort.least:
             break
@@ -191,7 +197,7 @@ def measure(
         times.append(seconds if good else nan)
         tips.append(position if good else np.full(3, nan))
         errors.append(error if good else nan)
-    return Measured(np.array(times), np.array(tips), np.array(errors))
+    return Measured(np.array(times), np.array(tips), np.array(errors), spent)
 
 
 def timed(solver: Solver, case: Case, known: Known) -> tuple[Answer, float]:
@@ -250,21 +256,25 @@ def points(scene: Scene, method: Method, referee: Referee, effort: Effort, done:
     farthest = np.inf if method.reduced else OTHER_EQUILIBRIUM * scene.arm.length
     result: list[Point] = []
     tips: list[Array] = []
-    begun = time.perf_counter()
+    spent, compiled = 0.0, False
     for setting in method.settings:
         blank = Point(scene.name, method.name, method.knob, label(setting), scene.start)
-        measured = Measured(np.empty(0), np.empty((0, 3)), np.empty(0))
+        measured = Measured(np.empty(0), np.empty((0, 3)), np.empty(0), 0.0)
         if not method.available():
-            point = blank._replace(note="not installed")
-        elif time.perf_counter() - begun > effort.patience:
-            point = blank._replace(note="not run: the coarser settings took too long")
+            point = blank._replace(note=NOT_INSTALLED)
+        elif spent > effort.patience:
+            point = blank._replace(note=NOT_RUN)
         else:
             try:
                 solver = method.build(scene.arm, setting, states)
             except ValueError as error:
-                point = blank._replace(note=f"cannot model this arm: {error}")
+                point = blank._replace(note=f"{REFUSES}: {error}")
             else:
+                if not compiled:
+                    timed(solver, scene.cases[order[0]], referee(order[0]))
+                    compiled = True
                 measured = measure(solver, scene.cases, order, referee, farthest, effort)
+                spent += measured.spent
                 floor = max(referee(index).error for index in order[: measured.time.size])
                 point = summary(blank._replace(floor=floor), measured)
         result.append(point)
@@ -280,7 +290,7 @@ def summary(point: Point, measured: Measured) -> Point:
     good = np.isfinite(measured.error)
     point = point._replace(cases=good.size, failed=int((~good).sum()))
     if not good.any():
-        return point._replace(note="fails on all cases")
+        return point._replace(note=FAILS)
     seconds, error = measured.time[good], measured.error[good]
     low, middle, high = np.quantile(seconds, [0.25, 0.5, 0.75]).tolist()
     median, p95, worst = np.quantile(error, [0.5, 0.95, 1.0]).tolist()
