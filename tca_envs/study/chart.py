@@ -56,29 +56,31 @@ def draw_scene(scene: Scene, group: Sequence[Point], names: Sequence[str], ours:
         figure.draw_without_rendering()
         bottom = legend.get_window_extent().transformed(aside.transAxes.inverted()).y0
         aside.text(0.0, bottom - 0.03, text, transform=aside.transAxes, va="top", fontsize=7.5, linespacing=1.35)
-    label_failures(figure, [(axes, group)])
+    label_failures(figure, [(axes, group)], chosen)
+    figure.set_layout_engine("none")  # nothing changes any more
     output.save_figure(figure, path)
 
 
 def draw_overview(scenes: Sequence[Scene], measured: Sequence[Point], names: Sequence[str], ours: str, path: Path) -> None:
     """Draw several scenes side by side into a PNG file, one legend below."""
     groups = [[p for p in measured if p.scene == scene.name] for scene in scenes]
-    figure, panels = output.new_figure(len(scenes), 3.9 * len(scenes) + 0.3, 5.2, sharex=True, sharey=True)
+    figure, panels = output.new_figure(len(scenes), 3.1 * len(scenes) + 0.4, 5.4, sharex=True, sharey=True)
     chosen = styles(names, ours)
     for axes, scene, group in zip(panels, scenes, groups, strict=True):
         draw(axes, group, chosen)
-        axes.set_title(scene.title, fontsize=11)
+        axes.set_title(scene.title.replace(": ", "\n"), fontsize=10)
         if axes is not panels[0]:
             axes.set_ylabel("")
         tried = [p for p in group if p.note not in (NOT_INSTALLED, NOT_RUN)]
         axes.annotate(
-            absent(tried, 66), (0.0, 0.0), xycoords="axes fraction", xytext=(0, -36), textcoords="offset points", va="top",
+            absent(tried, 52), (0.0, 0.0), xycoords="axes fraction", xytext=(0, -36), textcoords="offset points", va="top",
             fontsize=7, color="0.25",
         )  # fmt: skip
     everything = [p for group in groups for p in group]
     entries = handles(everything, chosen)
-    figure.legend(handles=entries, loc="outside lower center", ncols=min(3, len(entries)), frameon=False, fontsize=9)
-    label_failures(figure, list(zip(panels, groups, strict=True)))
+    figure.legend(handles=entries, loc="outside lower center", ncols=min(2, len(entries)), frameon=False, fontsize=8.5)
+    label_failures(figure, list(zip(panels, groups, strict=True)), chosen)
+    figure.set_layout_engine("none")
     output.save_figure(figure, path)
 
 
@@ -155,7 +157,9 @@ def absent(group: Sequence[Point], width: int) -> str:
     return "\n".join(lines)
 
 
-def label_failures(figure: "Figure", drawn: "Sequence[tuple[Axes, Sequence[Point]]]") -> None:
+def label_failures(
+    figure: "Figure", drawn: "Sequence[tuple[Axes, Sequence[Point]]]", chosen: dict[str, dict[str, Any]]
+) -> None:
     """Write the failure rates beside the hollow markers, where they cover nothing if that can be."""
     figure.draw_without_rendering()
     pixels = figure.dpi / 72.0
@@ -182,4 +186,6 @@ def label_failures(figure: "Figure", drawn: "Sequence[tuple[Axes, Sequence[Point
                 places.append((cost + (0 if inside else 100), offset, box))
             _, offset, box = min(places, key=lambda place: place[0])
             taken.append((*box, 20))
-            axes.annotate(text, (p.error, p.time), xytext=offset, textcoords="offset points", fontsize=7, color="0.25")
+            axes.annotate(
+                text, (p.error, p.time), xytext=offset, textcoords="offset points", fontsize=7, color=chosen[p.method]["color"]
+            )
