@@ -182,7 +182,7 @@ def ring(gripper: Gripper, gap: float, side: float, points: int = 30) -> Array:
 
 def draw6(sequences: dict[str, list[Frame]], path: Path) -> None:
     """Draw Fig. 6 into a PNG file: a row for each case, a panel for each step."""
-    output.require_matplotlib()
+    output.require("matplotlib")
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
