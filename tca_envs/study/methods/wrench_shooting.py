@@ -1,0 +1,354 @@
+"""Single shooting on the wrench form of the rod: the moment at the base and the muscles' tensions are all that is unknown.
+
+The force is known beforehand, so 3 + n unknowns do where the paper's shooting has 6 + n; tendons' tensions are known and do not
+count. The initial value problem of `study.wrench` goes from base to tip in fixed Runge-Kutta steps of order 4. A damped Newton
+on the moment at the tip and the muscles' lengths keeps its inverse Jacobian from one solve to the next, updates it by
+Broyden's formula and takes a new one by differences where it no longer serves. Where that fails, drive and load go from those
+of the guess to the asked ones in substeps.
+"""
+
+from collections.abc import Sequence
+from math import ceil
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tca_envs.mechanics import Arm, Equilibrium, Module
+from tca_envs.mechanics.algebra import entry, inner, rotation_matrix
+from tca_envs.mechanics.muscle import TENDON, elongation
+from tca_envs.mechanics.shooting import tension_units
+from tca_envs.study.method import Answer, Method, State
+from tca_envs.study.wrench import RK4, STATE, Rod, march, moment_unit, rod, tip_moment, wrench
+
+Array = NDArray[np.float64]
+
+DIFFERENCE = 1e-6
+"""Difference step of the scaled unknowns."""
+SETTLED = 1e-11
+"""Dimensionless imbalance of a section below which its strain is accepted."""
+SERVES = 0.5
+"""An old Jacobian serves as long as a step shrinks the residual to less than this."""
+MAX_STEP = 1.0
+"""Longest Newton step of the scaled unknowns."""
+HALVINGS = 6
+MAX_INTEGRATIONS = 60
+"""Of one Newton, but for those of Jacobians."""
+SMALLEST_SUBSTEP = 1.0 / 64.0
+STEPS_PER_TURN = 0.5
+"""Steps for each turn of a helical muscle, over those of a module without: the two kinds of module then err alike."""
+
+
+class Guess(NamedTuple):
+    """What a solve starts from."""
+
+    moment: Array
+    """At the base (3,) [N m]."""
+    tension: Array
+    """(n,) [N]."""
+    strain: Array
+    """At the base of each module (M, 6): where the sections' Newton starts."""
+    inverse: Array
+    """Inverse of the scaled Jacobian (N, N); zeros where it is not known."""
+    drive: Array
+    """(n,): where this is an equilibrium."""
+    load: Array
+    """The same."""
+
+
+class Scratch(NamedTuple):
+    """Arrays that the kernels share."""
+
+    state: Array  # (STATE + m,)
+    rates: Array  # (S, STATE + m)
+    strain: Array  # (6,)
+    tension: Array  # (n,) [N]
+
+
+@inner
+def shoot(rod, free, unit, x, drive, load, starts, scratch, residual):
+    """Integrate from base to tip.
+
+    Parameters
+    ----------
+    rod : Rod
+        The arm.
+    free : (N - 3,) array
+        The muscles whose tensions are unknown.
+    unit : (N,) array
+        Units of the unknowns.
+    x : (N,) array
+        Moment at the base and tensions, over their units.
+    drive, load : (n,), (LOAD,) arrays
+        Drives and external load.
+    starts : (M, 6) array
+        Near the strains at the modules' bases; out: those.
+    scratch : Scratch
+        Out: state at the tip, tensions.
+    residual : (N,) array
+        Out: moment at the tip less that applied, over its unit; length mismatch of the muscles over their rest lengths.
+
+    Returns
+    -------
+    float
+        Norm of the residual; inf where there is no answer.
+    """
+    state, strain, tension = scratch.state, scratch.strain, scratch.tension
+    for i in range(tension.size):
+        tension[i] = drive[i]  # that of a tendon
+    for j in range(free.size):
+        tension[free[j]] = unit[3 + j] * x[3 + j]
+    state[:] = 0.0
+    state[0] = 1.0
+    for i in range(3):
+        state[7 + i] = unit[i] * x[i]
+    station, row = 0, 3
+    for k in range(rod.steps.size):
+        i0, i1 = rod.first_muscle[k], rod.first_muscle[k + 1]
+        state[STATE:] = 0.0
+        if not march(rod, k, station, rod.steps[k], tension, load, state, starts[k], strain, scratch.rates):
+            return np.inf
+        station += rod.steps[k] * rod.b.size
+        for i in range(i0, i1):
+            if rod.kind[i] != TENDON:
+                rest = rod.rest_length[i]
+                delta, _, _ = elongation(rod.kind[i], rod.parameters, i, rest, tension[i], drive[i])
+                residual[row] = (state[STATE + i - i0] - rest - delta) / rest
+                row += 1
+    moment = tip_moment(load, rotation_matrix((state[0], state[1], state[2], state[3])))
+    total = 0.0
+    for i in range(3):
+        residual[i] = (state[7 + i] - moment[i]) / unit[i]
+    for i in range(residual.size):
+        total += residual[i] * residual[i]
+    return np.sqrt(total) if total < np.inf else np.inf
+
+
+@inner
+def invert(matrix, inverse):
+    """Invert a matrix by Gauss-Jordan elimination with row exchanges; False where it is singular. `matrix` is lost."""
+    n = matrix.shape[0]
+    for i in range(n):
+        for j in range(n):
+            inverse[i, j] = 1.0 if i == j else 0.0
+    for j in range(n):
+        p = j
+        for i in range(j + 1, n):
+            if abs(matrix[i, j]) > abs(matrix[p, j]):
+                p = i
+        if not 0.0 < abs(matrix[p, j]) < np.inf:
+            return False
+        for l in range(n):
+            matrix[j, l], matrix[p, l] = matrix[p, l], matrix[j, l]
+            inverse[j, l], inverse[p, l] = inverse[p, l], inverse[j, l]
+        d = 1.0 / matrix[j, j]
+        for l in range(n):
+            matrix[j, l] *= d
+            inverse[j, l] *= d
+        for i in range(n):
+            d = matrix[i, j]
+            if i != j and d != 0.0:
+                for l in range(n):
+                    matrix[i, l] -= d * matrix[j, l]
+                    inverse[i, l] -= d * inverse[j, l]
+    return True
+
+
+@inner
+def differentiate(rod, free, unit, x, drive, load, starts, scratch, residual, moved, matrix, inverse):
+    """Set `inverse` to the inverse of the Jacobian at x, by differences; False where it has none."""
+    for j in range(x.size):
+        keep = x[j]
+        x[j] += DIFFERENCE
+        size = shoot(rod, free, unit, x, drive, load, starts, scratch, moved)
+        x[j] = keep
+        if not size < np.inf:
+            return False
+        for i in range(x.size):
+            matrix[i, j] = (moved[i] - residual[i]) / DIFFERENCE
+    return invert(matrix, inverse)
+
+
+@inner
+def update(inverse, step, change, product):
+    """Let the inverse Jacobian map `change` of the residual to `step`, by Broyden's formula."""
+    n = step.size
+    scale = 0.0
+    for i in range(n):
+        product[i] = 0.0
+        for j in range(n):
+            product[i] += inverse[i, j] * change[j]
+        scale += step[i] * product[i]
+    if abs(scale) < 1e-300:
+        return
+    for j in range(n):
+        row = 0.0
+        for i in range(n):
+            row += step[i] * inverse[i, j]
+        row /= scale
+        # Column j of the old inverse is used above, and only there.
+        for i in range(n):
+            inverse[i, j] += (step[i] - product[i]) * row
+
+
+@inner
+def newton(rod, free, unit, x, drive, load, starts, inverse, tolerance, scratch):
+    """Solve by Newton from x, in place; whether it got there."""
+    n = x.size
+    residual, moved, step, trial = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    matrix = np.empty((n, n))
+    size = shoot(rod, free, unit, x, drive, load, starts, scratch, residual)
+    known = inverse[0, 0] != 0.0 or inverse[0, 1] != 0.0 or inverse[0, 2] != 0.0
+    new = False
+    spent = 1
+    while size < np.inf and spent < MAX_INTEGRATIONS:
+        if size < tolerance:
+            return True
+        if not known:
+            if not differentiate(rod, free, unit, x, drive, load, starts, scratch, residual, moved, matrix, inverse):
+                return False
+            known = new = True
+        longest = 0.0
+        for i in range(n):
+            step[i] = 0.0
+            for j in range(n):
+                step[i] -= inverse[i, j] * residual[j]
+            longest = max(longest, abs(step[i]))
+        if not longest < np.inf:
+            return False
+        part = min(1.0, MAX_STEP / max(longest, 1e-300))
+        for _ in range(HALVINGS if new else 1):
+            for i in range(n):
+                trial[i] = x[i] + part * step[i]
+            trial_size = shoot(rod, free, unit, trial, drive, load, starts, scratch, moved)
+            spent += 1
+            if trial_size < (1.0 - 0.1 * part) * size:
+                break
+            part *= 0.5
+        else:
+            if new:
+                return False
+            known = False
+            continue
+        known = trial_size < SERVES * size
+        new = False
+        for i in range(n):
+            step[i] = trial[i] - x[i]
+            moved[i] -= residual[i]
+            residual[i] += moved[i]
+            x[i] = trial[i]
+        update(inverse, step, moved, trial)
+        size = trial_size
+    return False
+
+
+@entry
+def solve(rod, free, unit, moment, tension, starts, inverse, from_drive, from_load, drive, load, tolerance, tip):
+    """Find the equilibrium that continues a known one.
+
+    Parameters
+    ----------
+    rod, free, unit
+        As of `shoot`.
+    moment, tension, starts, inverse : arrays
+        In: as in `Guess`; out: those of the answer.
+    from_drive, from_load : (n,), (LOAD,) arrays
+        Where the guess is an equilibrium.
+    drive, load : (n,), (LOAD,) arrays
+        What is asked.
+    tolerance : float
+        Norm of the residual below which it is an answer.
+    tip : (4, 4) array
+        Out: the tip's pose [m], but for the last row.
+
+    Returns
+    -------
+    bool
+        Whether there is an answer.
+    """
+    wide = STATE + rod.route.shape[1]
+    scratch = Scratch(np.empty(wide), np.empty((rod.b.size, wide)), np.empty(6), np.empty(tension.size))
+    x = np.empty(unit.size)
+    for i in range(3):
+        x[i] = moment[i] / unit[i]
+    for j in range(free.size):
+        x[3 + j] = tension[free[j]] / unit[3 + j]
+    good_x, good_starts, good_inverse = x.copy(), starts.copy(), inverse.copy()
+    drive_now, load_now = drive.copy(), load.copy()
+    done, substep = 0.0, 1.0
+    while substep >= SMALLEST_SUBSTEP:
+        here = min(1.0, done + substep)
+        for i in range(drive.size):
+            drive_now[i] = drive[i] if here == 1.0 else from_drive[i] + here * (drive[i] - from_drive[i])
+        for i in range(load.size):
+            load_now[i] = load[i] if here == 1.0 else from_load[i] + here * (load[i] - from_load[i])
+        if newton(rod, free, unit, x, drive_now, load_now, starts, inverse, tolerance, scratch):
+            if here == 1.0:
+                break
+            done, substep = here, 2.0 * substep
+            good_x[:], good_starts[:], good_inverse[:] = x, starts, inverse
+        else:
+            substep *= 0.25 if substep == 1.0 else 0.5
+            x[:], starts[:], inverse[:] = good_x, good_starts, good_inverse
+    if substep < SMALLEST_SUBSTEP:
+        return False
+    for i in range(3):
+        moment[i] = unit[i] * x[i]
+    tension[:] = scratch.tension
+    state = scratch.state
+    r = rotation_matrix((state[0], state[1], state[2], state[3]))
+    for i in range(3):
+        for j in range(3):
+            tip[i, j] = r[3 * i + j]
+        tip[i, 3] = state[4 + i]
+    return True
+
+
+class WrenchShooting(NamedTuple):
+    """The method made ready for one arm."""
+
+    arm: Arm
+    rod: Rod
+    free: NDArray[np.int64]
+    unit: Array
+    tolerance: float
+
+    def cold(self) -> Guess:
+        """Return the unloaded arm."""
+        _, tension, drive, load = self.arm.unloaded()
+        n = len(self.unit)
+        return Guess(np.zeros(3), tension, self.rod.reference.copy(), np.zeros((n, n)), drive, load)
+
+    def near(self, known: Equilibrium, state: State) -> Guess:
+        """Return the moment at the base and the tensions of a known equilibrium."""
+        strain = known.strain(np.concatenate([[0.0], np.cumsum(self.rod.length)[:-1]]))
+        first = self.arm.modules[0]
+        moment = wrench(first, 0.0, strain[0], known.tensions[: len(first.muscles)])[:3]
+        n = len(self.unit)
+        return Guess(moment, known.tensions, strain, np.zeros((n, n)), *known.known)
+
+    def solve(self, state: State, guess: Guess) -> Answer:
+        """Solve for the equilibrium at `state`."""
+        drive, load, tip = state.drive, state.load, np.eye(4)
+        found = Guess(*(x.copy() for x in guess[:4]), drive, load)
+        converged = solve(
+            self.rod, self.free, self.unit, *found[:4], guess.drive, guess.load, drive, load, self.tolerance, tip
+        )
+        return Answer(converged, tip, found if converged else None)
+
+
+def module_steps(module: Module, steps: int) -> int:
+    """Return the steps of a module: `steps`, or more where helical muscles turn its strain."""
+    turns = max((abs(muscle.turns) for muscle in module.muscles), default=0.0)
+    return max(steps, ceil(STEPS_PER_TURN * turns * steps))
+
+
+def build(arm: Arm, steps: int, states: Sequence[State]) -> WrenchShooting:
+    """Return the solver for a number of steps in each module, see `module_steps`."""
+    made = rod(arm, RK4, [module_steps(module, steps) for module in arm.modules], SETTLED)
+    free = np.flatnonzero(made.kind != TENDON)
+    unit = np.concatenate([np.full(3, moment_unit(arm)), tension_units(arm)[free]])
+    return WrenchShooting(arm, made, free, unit, 1e-9)
+
+
+METHOD = Method("wrench shooting, RK4", "steps", (2, 4, 8, 16, 32, 64), build)
