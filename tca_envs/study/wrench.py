@@ -15,11 +15,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from tca_envs.mechanics import Arm, Module
 from tca_envs.mechanics.algebra import (
+    INNER,
     apply,
     apply_transposed,
     axpy,
@@ -80,10 +82,11 @@ class Rod(NamedTuple):
     mass_below: Array  # (T,) mass of the arm beyond each station [kg]
     a: Array  # (S, S) Runge-Kutta coefficients
     b: Array  # (S,) weights
+    c: Array  # (S,) stages' places in a step
     kind: NDArray[np.int64]  # (n,) kind of muscle law
     parameters: Array  # (n, PARAMETERS) of muscle law
     rest_length: Array  # (n,) [m]
-    settled: float  # a section's Newton stops when |moment imbalance| L/K and |force imbalance|/K are below this
+    settled: float  # a section's Newton takes its last step when |moment imbalance| L/K and |force imbalance|/K are below this
 
 
 def rod(arm: Arm, tableau: Tableau, steps: Sequence[int], settled: float) -> Rod:
@@ -98,7 +101,7 @@ def rod(arm: Arm, tableau: Tableau, steps: Sequence[int], settled: float) -> Rod
     steps : sequence of int
         Number of steps of each module.
     settled : float
-        Dimensionless imbalance below which the strain of a section is accepted.
+        Dimensionless imbalance of a section below which one more Newton step, which squares it, ends its solve.
     """
     modules = arm.modules
     most_muscles = max(len(module.muscles) for module in modules)
@@ -121,6 +124,7 @@ def rod(arm: Arm, tableau: Tableau, steps: Sequence[int], settled: float) -> Rod
         mass_below=np.concatenate(masses),
         a=tableau.a,
         b=tableau.b,
+        c=tableau.c,
         kind=arm.model.kind,
         parameters=arm.model.parameters,
         rest_length=arm.rest_lengths,
@@ -145,7 +149,7 @@ def wrench(module: Module, fraction: float, strain: Array, tension: Array) -> Ar
     return result
 
 
-@inner
+@njit(forceinline=True, **INNER)  # a call would copy all of `rod`
 def settle(rod, k, station, tension, moment, force, strain, stretch):
     """Find the strain that carries a wrench, by Newton, in place.
 
@@ -189,7 +193,6 @@ def settle(rod, k, station, tension, moment, force, strain, stretch):
             norm = np.sqrt(dot(t, t))
             if not norm > 1e-9:
                 return False
-            stretch[c] = norm
             t = axpy(1.0 / norm, t, (0.0, 0.0, 0.0))
             lever = (y * t[2], -x * t[2], x * t[1] - y * t[0])
             f = tension[i0 + c]
@@ -202,10 +205,6 @@ def settle(rod, k, station, tension, moment, force, strain, stretch):
             length * max(abs(ru[0] / ku[0]), abs(ru[1] / ku[1]), abs(ru[2] / ku[2])),
             max(abs(rv[0] / kv[0]), abs(rv[1] / kv[1]), abs(rv[2] / kv[2])),
         )
-        if worst < rod.settled:
-            strain[0], strain[1], strain[2] = u
-            strain[3], strain[4], strain[5] = v
-            return True
         if not worst < 1e6:
             return False
         flexibility = inverse(vv)
@@ -213,11 +212,20 @@ def settle(rod, k, station, tension, moment, force, strain, stretch):
         bend = apply(inverse(axpy9(-1.0, matmul(gain, transpose(uv)), uu)), axpy(-1.0, ru, apply(gain, rv)))
         shear = apply(flexibility, axpy(-1.0, rv, axpy(-1.0, apply_transposed(uv, bend), (0.0, 0.0, 0.0))))
         u, v = axpy(1.0, bend, u), axpy(1.0, shear, v)
+        if worst < rod.settled:
+            strain[0], strain[1], strain[2] = u
+            strain[3], strain[4], strain[5] = v
+            # The last step squares the imbalance: it is not looked at again.
+            for c in range(mk):
+                x, y = route[station, c, 0], route[station, c, 1]
+                t = (v[0] - u[2] * y + route[station, c, 2], v[1] + u[2] * x + route[station, c, 3], v[2] + u[0] * y - u[1] * x)
+                stretch[c] = np.sqrt(dot(t, t))
+            return True
     return False
 
 
 @inner
-def march(rod, k, station, steps, tension, load, state, base, strain, rates):
+def march(rod, k, station, steps, tension, load, state, base, strain, past, rates):
     """Integrate over steps of one module, in place.
 
     Parameters
@@ -234,8 +242,8 @@ def march(rod, k, station, steps, tension, load, state, base, strain, rates):
         State at the first station; out: that after the steps.
     base : (6,) array
         Near the strain at the first station; out: that strain.
-    strain : (6,) array
-        Scratch; out: the strain at the last station.
+    strain, past : (6,) arrays
+        Scratch.
     rates : (S, STATE + m) array
         Scratch.
 
@@ -250,7 +258,8 @@ def march(rod, k, station, steps, tension, load, state, base, strain, rates):
     gravity = (load[6], load[7], load[8])
     tip_force = (load[0], load[1], load[2])
     for l in range(6):
-        strain[l] = base[l]
+        strain[l], past[l] = base[l], base[l]
+    here = before = 0.0
     for step in range(steps):
         for i in range(b.size):
             q = (state[0], state[1], state[2], state[3])
@@ -265,6 +274,15 @@ def march(rod, k, station, steps, tension, load, state, base, strain, rates):
                         q[3] + d * rates[j, 3],
                     )
                     m = axpy(d, get3(rates, j, 7), m)
+            # The strain is guessed on the line through those of the two places before.
+            there = step + rod.c[i]
+            if there != here:
+                ahead = (there - here) / (here - before) if here != before else 0.0
+                before, here = here, there
+                for l in range(6):
+                    now = strain[l]
+                    strain[l] += ahead * (now - past[l])
+                    past[l] = now
             n = axpy(load[PAYLOAD_MASS] + rod.mass_below[station], gravity, tip_force)
             r = rotation_matrix(q)
             if not settle(

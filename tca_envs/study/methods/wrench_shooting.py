@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 DIFFERENCE = 1e-6
 """Difference step of the scaled unknowns."""
-SETTLED = 1e-11
+SETTLED = 0.02
 """Dimensionless imbalance of a section below which its strain is accepted."""
 SERVES = 0.5
 """An old Jacobian serves as long as a step shrinks the residual to less than this."""
@@ -62,6 +62,7 @@ class Scratch(NamedTuple):
     state: Array  # (STATE + m,)
     rates: Array  # (S, STATE + m)
     strain: Array  # (6,)
+    past: Array  # (6,)
     tension: Array  # (n,) [N]
 
 
@@ -93,7 +94,7 @@ def shoot(rod, free, unit, x, drive, load, starts, scratch, residual):
     float
         Norm of the residual; inf where there is no answer.
     """
-    state, strain, tension = scratch.state, scratch.strain, scratch.tension
+    state, tension = scratch.state, scratch.tension
     for i in range(tension.size):
         tension[i] = drive[i]  # that of a tendon
     for j in range(free.size):
@@ -106,7 +107,7 @@ def shoot(rod, free, unit, x, drive, load, starts, scratch, residual):
     for k in range(rod.steps.size):
         i0, i1 = rod.first_muscle[k], rod.first_muscle[k + 1]
         state[STATE:] = 0.0
-        if not march(rod, k, station, rod.steps[k], tension, load, state, starts[k], strain, scratch.rates):
+        if not march(rod, k, station, rod.steps[k], tension, load, state, starts[k], scratch.strain, scratch.past, scratch.rates):
             return np.inf
         station += rod.steps[k] * rod.b.size
         for i in range(i0, i1):
@@ -267,7 +268,7 @@ def solve(rod, free, unit, moment, tension, starts, inverse, from_drive, from_lo
         Whether there is an answer.
     """
     wide = STATE + rod.route.shape[1]
-    scratch = Scratch(np.empty(wide), np.empty((rod.b.size, wide)), np.empty(6), np.empty(tension.size))
+    scratch = Scratch(np.empty(wide), np.empty((rod.b.size, wide)), np.empty(6), np.empty(6), np.empty(tension.size))
     x = np.empty(unit.size)
     for i in range(3):
         x[i] = moment[i] / unit[i]
@@ -345,7 +346,7 @@ def module_steps(module: Module, steps: int) -> int:
 
 def build(arm: Arm, steps: int, states: Sequence[State]) -> WrenchShooting:
     """Return the solver for a number of steps in each module, see `module_steps`."""
-    made = rod(arm, RK4, [module_steps(module, steps) for module in arm.modules], SETTLED)
+    made = rod(arm, RK4, [module_steps(module, steps) for module in arm.modules], SETTLED / steps**2)
     free = np.flatnonzero(made.kind != TENDON)
     unit = np.concatenate([np.full(3, moment_unit(arm)), tension_units(arm)[free]])
     return WrenchShooting(arm, made, free, unit, 1e-9)

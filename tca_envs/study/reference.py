@@ -1,0 +1,336 @@
+"""Equilibria to round-off, to measure errors against: multiple shooting on the wrench form of the rod.
+
+Each module is cut into segments; unknown are the rotation and the moment where each segment starts (at the base the moment
+alone) and the muscles' tensions. A segment is integrated by Runge-Kutta steps of order 8, so errors do not grow along the arm
+as they do in single shooting. Newton starts from a known equilibrium and stays on its branch; steps are doubled until the tip
+no longer moves. It shares arm and muscle laws with `Arm.equilibrium` and no numerics.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from math import ceil
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lu_factor, lu_solve
+from scipy.spatial.transform import Rotation
+
+from tca_envs.mechanics import Arm, Equilibrium, Module
+from tca_envs.mechanics.algebra import entry, quaternion_turn
+from tca_envs.mechanics.arm import pose
+from tca_envs.mechanics.muscle import TENDON, elongation
+from tca_envs.mechanics.shooting import tension_units
+from tca_envs.study.method import State
+from tca_envs.study.wrench import RK8, STATE, Rod, march, moment_unit, rod, wrench
+
+Array = NDArray[np.float64]
+
+SEGMENT = 12e-3
+"""Longest segment [m]."""
+STEP = 2.5e-3
+"""Longest step of the coarsest integration [m] in a module without helical muscles."""
+STEPS_PER_TURN = 10
+"""Fewest steps of the coarsest integration for each turn of a helical muscle."""
+DOUBLINGS = 4
+SETTLED = 1e-8
+"""Imbalance of a section that a last Newton step squares."""
+DIFFERENCE = 1e-6
+"""Difference step of the scaled unknowns."""
+MAX_ITERATIONS = 12
+ROUND_OFF = 1e-12
+"""Scaled residual below which Newton has come to round-off."""
+STILL = 1e-13
+"""Steps are fine enough where doubling them moves the tip by less than this, over the arm's length."""
+CONTRACTION = 0.1
+"""Newton takes a new Jacobian where a step shrinks the residual by less."""
+
+
+class NoReference(ArithmeticError):
+    """Newton or the doubling of steps did not come to round-off."""
+
+
+class Reference(NamedTuple):
+    """An equilibrium to round-off."""
+
+    tip: Array
+    """Pose of the tip (4, 4) [m]."""
+    tensions: Array
+    """(n,) [N]."""
+    residual: float
+    """Largest scaled mismatch: rotation [rad] and moment where segments meet and at the tip, lengths of muscles."""
+    error: float
+    """Estimated error of the tip's position [m]: how far the last doubling of steps moved it."""
+    moved: float
+    """Distance of the tip from that of the known equilibrium [m]."""
+
+
+class Segments(NamedTuple):
+    """An arm cut into segments, at one number of steps."""
+
+    rod: Rod
+    module: NDArray[np.int64]
+    """(P,) module of each segment."""
+    station: NDArray[np.int64]
+    """(P,) first station of each segment."""
+    steps: NDArray[np.int64]
+    """(P,) steps of each segment."""
+    unit: float
+    """Of moments [N m]."""
+    tension_unit: Array
+    """(n,) [N]."""
+
+
+@lru_cache(maxsize=16)
+def segments(arm: Arm, doubling: int) -> Segments:
+    """Return an arm cut into segments, with 2**doubling times the coarsest steps."""
+    counts = [ceil(module.length / SEGMENT) for module in arm.modules]
+    steps = [
+        2**doubling * ceil(_coarsest(module) / count) for module, count in zip(arm.modules, counts, strict=True)
+    ]
+    stations = len(RK8.b) * np.repeat(steps, counts)
+    return Segments(
+        rod(arm, RK8, [count * n for count, n in zip(counts, steps, strict=True)], SETTLED),
+        np.repeat(np.arange(len(counts)), counts),
+        np.cumsum(stations) - stations,
+        np.repeat(steps, counts),
+        moment_unit(arm),
+        tension_units(arm),
+    )
+
+
+def _coarsest(module: Module) -> float:
+    turns = max((abs(muscle.turns) for muscle in module.muscles), default=0.0)
+    return max(module.length / STEP, STEPS_PER_TURN * turns)
+
+
+@entry
+def carry(rod, module, station, steps, starts, strains, tension, load, ends):
+    """Integrate every segment.
+
+    Parameters
+    ----------
+    rod : Rod
+        The arm.
+    module, station, steps : (P,) arrays
+        Of each segment.
+    starts : (P, STATE) array
+        State where each segment starts.
+    strains : (P, 6) array
+        Near the strains there; out: those.
+    tension, load : (n,), (LOAD,) arrays
+        Tensions [N] and external load.
+    ends : (P, STATE + m) array
+        Out: state where each segment ends and the path lengths on it.
+
+    Returns
+    -------
+    bool
+        False where a section has no strain that carries its wrench.
+    """
+    rates = np.empty((rod.b.size, ends.shape[1]))
+    strain, past = np.empty(6), np.empty(6)
+    for p in range(starts.shape[0]):
+        ends[p, :STATE] = starts[p]
+        ends[p, STATE:] = 0.0
+        if not march(rod, module[p], station[p], steps[p], tension, load, ends[p], strains[p], strain, past, rates):
+            return False
+    return True
+
+
+@entry
+def differentiate(rod, module, station, steps, starts, strains, tension, load, ends, unit, tension_unit, blocks):
+    """Differentiate every segment's end by differences.
+
+    Arguments as in `carry`, with `ends` as it left them, the units of moments and tensions, and for output `blocks`
+    (P, 6 + m, 6 + m): rotation [rad], scaled moment and path lengths [m] at the end, by rotation and scaled moment at the
+    start and scaled tensions of the module's muscles.
+    """
+    rates = np.empty((rod.b.size, ends.shape[1]))
+    base, strain, past, forces = np.empty(6), np.empty(6), np.empty(6), tension.copy()
+    state = np.empty(ends.shape[1])
+    for p in range(starts.shape[0]):
+        k = module[p]
+        i0, mk = rod.first_muscle[k], rod.first_muscle[k + 1] - rod.first_muscle[k]
+        for j in range(6 + mk):
+            state[:STATE] = starts[p]
+            state[STATE:] = 0.0
+            if j < 3:
+                turn = (0.5 * DIFFERENCE * (j == 0), 0.5 * DIFFERENCE * (j == 1), 0.5 * DIFFERENCE * (j == 2))
+                state[0], state[1], state[2], state[3] = quaternion_turn(turn, (state[0], state[1], state[2], state[3]))
+            elif j < 6:
+                state[4 + j] += DIFFERENCE * unit
+            else:
+                forces[i0 + j - 6] += DIFFERENCE * tension_unit[i0 + j - 6]
+            base[:] = strains[p]
+            if not march(rod, k, station[p], steps[p], forces, load, state, base, strain, past, rates):
+                return False
+            if j >= 6:
+                forces[i0 + j - 6] = tension[i0 + j - 6]
+            # twice the vector part of q o q0^-1, for unit quaternions the rotation vector
+            a, b = state, ends[p]
+            scale = 2.0 / (DIFFERENCE * np.sqrt(np.sum(a[:4] * a[:4]) * np.sum(b[:4] * b[:4])))
+            blocks[p, 0, j] = scale * (a[1] * b[0] - a[0] * b[1] - a[2] * b[3] + a[3] * b[2])
+            blocks[p, 1, j] = scale * (a[2] * b[0] - a[0] * b[2] - a[3] * b[1] + a[1] * b[3])
+            blocks[p, 2, j] = scale * (a[3] * b[0] - a[0] * b[3] - a[1] * b[2] + a[2] * b[1])
+            for i in range(3):
+                blocks[p, 3 + i, j] = (a[7 + i] - b[7 + i]) / (unit * DIFFERENCE)
+            for i in range(mk):
+                blocks[p, 6 + i, j] = (a[STATE + i] - b[STATE + i]) / DIFFERENCE
+    return True
+
+
+@dataclass(eq=False)
+class Guess:
+    """The unknowns of an arm's P segments; Newton moves them in place."""
+
+    starts: Array
+    """(P, STATE) where each segment starts: quaternion, position 0, moment [N m]."""
+    strains: Array
+    """(P, 6) near the strains there."""
+    tension: Array
+    """(n,) [N]."""
+
+    def move(self, cut: Segments, step: Array) -> None:
+        """Add a step of the scaled unknowns: moment at the base, then rotation and moment of each segment, then tensions."""
+        count = len(self.starts)
+        each = np.concatenate([np.zeros(3), step[: 6 * count - 3]]).reshape(count, 6)
+        for start, turn in zip(self.starts, each[:, :3], strict=True):
+            turned = Rotation.from_rotvec(turn) * Rotation.from_quat(start[:4], scalar_first=True)
+            start[:4] = turned.as_quat(scalar_first=True)
+        self.starts[:, 7:10] += cut.unit * each[:, 3:]
+        self.tension += cut.tension_unit * step[6 * count - 3 :]
+
+
+def mismatch(cut: Segments, guess: Guess, state: State) -> tuple[Array, Array]:
+    """Return the scaled residual (6 P - 3 + n,) and the segments' ends (P, STATE + m).
+
+    The residual is rotation [rad] and moment at the end of each segment less those where the next one starts, the moment at
+    the tip less that applied, and the muscles' length mismatch over their rest lengths (tendons: tension over its unit).
+    """
+    rod, load = cut.rod, state.load
+    ends = np.empty((len(cut.module), STATE + rod.route.shape[1]))
+    if not carry(rod, cut.module, cut.station, cut.steps, guess.starts, guess.strains, guess.tension, load, ends):
+        raise NoReference("a section has no strain that carries its wrench")
+    met = Rotation.from_quat(ends[:-1, :4], scalar_first=True) * Rotation.from_quat(guess.starts[1:, :4], scalar_first=True).inv()
+    joints = np.hstack([met.as_rotvec(), (ends[:-1, 7:10] - guess.starts[1:, 7:10]) / cut.unit])
+    lever, weight = _payload(load, ends[-1])
+    tip = (ends[-1, 7:10] - load[3:6] - np.cross(lever, weight)) / cut.unit
+    lengths = np.zeros(len(guess.tension))
+    for p, k in enumerate(cut.module):
+        muscles = slice(rod.first_muscle[k], rod.first_muscle[k + 1])
+        lengths[muscles] += ends[p, STATE:][: muscles.stop - muscles.start]
+    rows = np.empty(len(lengths))
+    for i, (force, drive, rest) in enumerate(zip(guess.tension, state.drive, rod.rest_length, strict=True)):
+        if rod.kind[i] == TENDON:
+            rows[i] = (force - drive) / cut.tension_unit[i]
+        else:
+            rows[i] = (lengths[i] - rest - elongation(rod.kind[i], rod.parameters, i, rest, force, drive)[0]) / rest
+    return np.concatenate([joints.ravel(), tip, rows]), ends
+
+
+def _payload(load: Array, end: Array) -> tuple[Array, Array]:
+    """Return the lever [m] and the weight [N] of what hangs from the tip, in the base frame."""
+    return pose(end[:4], end[4:7])[:3, :3] @ load[10:13], load[9] * load[6:9]
+
+
+def jacobian(cut: Segments, guess: Guess, state: State, ends: Array) -> Array:
+    """Return the derivative (N, N) of the residual in the unknowns, N = 6 P - 3 + n."""
+    rod, load, count, n = cut.rod, state.load, len(cut.module), len(guess.tension)
+    wide = 6 + rod.route.shape[1]
+    blocks = np.zeros((count, wide, wide))
+    if not differentiate(
+        rod, cut.module, cut.station, cut.steps, guess.starts, guess.strains, guess.tension, load, ends,
+        cut.unit, cut.tension_unit, blocks,
+    ):  # fmt: skip
+        raise NoReference("a section has no strain that carries its wrench")
+    lever, weight = _payload(load, ends[-1])
+    # By the base's rotation as well: these three columns are left out below.
+    result = np.zeros((6 * count + n, 6 * count + n))
+    for p, k in enumerate(cut.module):
+        i0, i1 = rod.first_muscle[k], rod.first_muscle[k + 1]
+        rows, muscles = slice(6 * p, 6 * p + 6), slice(6 * count + i0, 6 * count + i1)
+        result[rows, rows], result[rows, muscles] = blocks[p, :6, :6], blocks[p, :6, 6 : 6 + i1 - i0]
+        result[muscles, rows], inside = blocks[p, 6 : 6 + i1 - i0, :6], blocks[p, 6 : 6 + i1 - i0, 6 : 6 + i1 - i0]
+        result[muscles, muscles] += inside
+        if p + 1 < count:
+            result[rows, 6 * p + 6 : 6 * p + 12] = -np.eye(6)
+        else:
+            turned, bent = result[rows][:3].copy(), result[rows][3:]
+            turning = (np.outer(lever, weight) - lever @ weight * np.eye(3)) / cut.unit
+            result[rows][3:] = bent - turning @ turned
+    for i in range(n):
+        row, rest, unit = result[6 * count + i], rod.rest_length[i], cut.tension_unit[i]
+        if rod.kind[i] == TENDON:
+            row[:] = 0.0
+            row[6 * count + i] = 1.0
+        else:
+            slope = elongation(rod.kind[i], rod.parameters, i, rest, guess.tension[i], state.drive[i])[1]
+            row[6 * count + i] -= slope * unit
+            row /= rest
+    keep = np.delete(np.arange(6 * count + n), slice(6 * count - 6, 6 * count - 3))  # the tip's rotation is free
+    return result[keep][:, 3:]
+
+
+def newton(cut: Segments, guess: Guess, state: State, factors: Any = None) -> tuple[float, Array, Any]:
+    """Move `guess` to the equilibrium; return the largest residual, the segments' ends and the factors of the Jacobian.
+
+    Old `factors` serve as long as they help. Raises NoReference where it does not come to round-off.
+    """
+    residual, ends = mismatch(cut, guess, state)
+    size = float(np.abs(residual).max())
+    for _ in range(MAX_ITERATIONS):
+        if factors is None:
+            factors = lu_factor(jacobian(cut, guess, state, ends))
+        guess.move(cut, -lu_solve(factors, residual))
+        before = size
+        residual, ends = mismatch(cut, guess, state)
+        size = float(np.abs(residual).max())
+        if size < ROUND_OFF and size > CONTRACTION * before:
+            return size, ends, factors
+        if not size < CONTRACTION * before:
+            factors = None
+    raise NoReference(f"Newton stopped at a residual of {size:.1e}")
+
+
+def reference(state: State, near: Equilibrium) -> Reference:
+    """Find the equilibrium at `state` to round-off.
+
+    Parameters
+    ----------
+    state : State
+        What is asked.
+    near : Equilibrium
+        An equilibrium there on a fine grid: the reference is on its branch.
+
+    Returns
+    -------
+    Reference
+        The equilibrium.
+
+    Raises
+    ------
+    NoReference
+        Where Newton does not come to round-off, or finer steps still move the tip.
+    """
+    arm = state.arm
+    cut = segments(arm, 0)
+    modules = [arm.modules[k] for k in cut.module]
+    bases = np.concatenate([[0.0], np.cumsum(cut.rod.length)])
+    fraction = np.concatenate([np.arange(n) / n for n in np.bincount(cut.module)])
+    poses, strains = near.sample(bases[cut.module] + fraction * cut.rod.length[cut.module])
+    starts = np.zeros((len(modules), STATE))
+    starts[:, :4] = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
+    for p, (k, module) in enumerate(zip(cut.module, modules, strict=True)):
+        tension = near.tensions[cut.rod.first_muscle[k] : cut.rod.first_muscle[k + 1]]
+        starts[p, 7:10] = poses[p, :3, :3] @ wrench(module, fraction[p], strains[p], tension)[:3]
+    guess, factors, tip, last = Guess(starts, strains, near.tensions.copy()), None, np.eye(4), None
+    for doubling in range(DOUBLINGS + 1):
+        residual, ends, factors = newton(segments(arm, doubling), guess, state, factors)
+        tip = pose(ends[-1, :4], ends[:, 4:7].sum(axis=0))
+        error = np.inf if last is None else float(np.linalg.norm(tip[:3, 3] - last))
+        last = tip[:3, 3]
+        if error < STILL * arm.length:
+            moved = float(np.linalg.norm(last - near.tip_pose[:3, 3]))
+            return Reference(tip, guess.tension, residual, error, moved)
+    raise NoReference(f"twice as many steps still move the tip by {error:.1e} m")
