@@ -189,8 +189,8 @@ def integrals(c: Array, x: Array) -> Array:
     q = len(c)
     legendre = np.polynomial.legendre
     vandermonde = legendre.legvander(2.0 * c - 1.0, q - 1)
-    columns = [legendre.legval(2.0 * x - 1.0, legendre.legint(np.eye(q)[k], lbnd=-1.0)) / 2.0 for k in range(q)]
-    return np.asarray(np.linalg.solve(vandermonde.T, np.array(columns)).T, dtype=np.float64)
+    columns = legendre.legval(2.0 * x - 1.0, legendre.legint(np.eye(q), lbnd=-1.0)) / 2.0
+    return np.asarray(np.linalg.solve(vandermonde.T, columns).T, dtype=np.float64)
 
 
 def default_grid(module: Module) -> Grid:

@@ -26,7 +26,7 @@ from tca_envs.study.wrench import RK8, STATE, Rod, march, moment_unit, rod, wren
 
 Array = NDArray[np.float64]
 
-SEGMENT = 12e-3
+SEGMENT = 15e-3
 """Longest segment [m]."""
 STEP = 2.5e-3
 """Longest step of the coarsest integration [m] in a module without helical muscles."""
@@ -39,8 +39,10 @@ DIFFERENCE = 1e-6
 """Difference step of the scaled unknowns."""
 MAX_ITERATIONS = 12
 ROUND_OFF = 1e-12
-"""Scaled residual below which Newton has come to round-off."""
-STILL = 1e-13
+"""Largest scaled residual at which Newton may come to a standstill."""
+CLEAN = 2e-14
+"""Scaled residual at which it need not go on."""
+STILL = 1e-12
 """Steps are fine enough where doubling them moves the tip by less than this, over the arm's length."""
 CONTRACTION = 0.1
 """Newton takes a new Jacobian where a step shrinks the residual by less."""
@@ -286,7 +288,7 @@ def newton(cut: Segments, guess: Guess, state: State, factors: Any = None) -> tu
         before = size
         residual, ends = mismatch(cut, guess, state)
         size = float(np.abs(residual).max())
-        if size < ROUND_OFF and size > CONTRACTION * before:
+        if size < CLEAN or CONTRACTION * before < size < ROUND_OFF:
             return size, ends, factors
         if not size < CONTRACTION * before:
             factors = None
