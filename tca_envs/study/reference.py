@@ -17,12 +17,12 @@ from scipy.linalg import lu_factor, lu_solve
 from scipy.spatial.transform import Rotation
 
 from tca_envs.mechanics import Arm, Equilibrium, Module
-from tca_envs.mechanics.algebra import entry, quaternion_turn
+from tca_envs.mechanics.algebra import entry
 from tca_envs.mechanics.arm import pose
 from tca_envs.mechanics.muscle import TENDON, elongation
 from tca_envs.mechanics.shooting import tension_units
 from tca_envs.study.method import State
-from tca_envs.study.wrench import RK8, STATE, Rod, march, moment_unit, rod, wrench
+from tca_envs.study.wrench import RK8, STATE, Rod, march, moment_unit, rod, scratch, wrench
 
 Array = NDArray[np.float64]
 
@@ -35,15 +35,14 @@ STEPS_PER_TURN = 10
 DOUBLINGS = 4
 SETTLED = 1e-8
 """Imbalance of a section that a last Newton step squares."""
-DIFFERENCE = 1e-6
-"""Difference step of the scaled unknowns."""
 MAX_ITERATIONS = 12
 ROUND_OFF = 1e-12
 """Largest scaled residual at which Newton may come to a standstill."""
 CLEAN = 2e-14
 """Scaled residual at which it need not go on."""
-STILL = 1e-12
-"""Steps are fine enough where doubling them moves the tip by less than this, over the arm's length."""
+STILL = 1e-11
+"""Steps are fine enough where doubling them moves the tip by less than this, over the arm's length. The error that is left
+is some 256 times smaller."""
 CONTRACTION = 0.1
 """Newton takes a new Jacobian where a step shrinks the residual by less."""
 
@@ -87,9 +86,7 @@ class Segments(NamedTuple):
 def segments(arm: Arm, doubling: int) -> Segments:
     """Return an arm cut into segments, with 2**doubling times the coarsest steps."""
     counts = [ceil(module.length / SEGMENT) for module in arm.modules]
-    steps = [
-        2**doubling * ceil(_coarsest(module) / count) for module, count in zip(arm.modules, counts, strict=True)
-    ]
+    steps = [2**doubling * ceil(_coarsest(module) / count) for module, count in zip(arm.modules, counts, strict=True)]
     stations = len(RK8.b) * np.repeat(steps, counts)
     return Segments(
         rod(arm, RK8, [count * n for count, n in zip(counts, steps, strict=True)], SETTLED),
@@ -107,7 +104,7 @@ def _coarsest(module: Module) -> float:
 
 
 @entry
-def carry(rod, module, station, steps, starts, strains, tension, load, ends):
+def carry(rod, module, station, steps, starts, strains, tension, load, ends, tangents):
     """Integrate every segment.
 
     Parameters
@@ -124,61 +121,28 @@ def carry(rod, module, station, steps, starts, strains, tension, load, ends):
         Tensions [N] and external load.
     ends : (P, STATE + m) array
         Out: state where each segment ends and the path lengths on it.
+    tangents : (P, 6 + m, 6 + m) array
+        Out: by row for a turn [rad] or a moment [N m] at the start or a tension [N] of the module's muscles, how rotation,
+        moment and path lengths at the end change; (P, 0, 6 + m) where that is not asked for.
 
     Returns
     -------
     bool
         False where a section has no strain that carries its wrench.
     """
-    rates = np.empty((rod.b.size, ends.shape[1]))
-    strain, past = np.empty(6), np.empty(6)
-    for p in range(starts.shape[0]):
-        ends[p, :STATE] = starts[p]
-        ends[p, STATE:] = 0.0
-        if not march(rod, module[p], station[p], steps[p], tension, load, ends[p], strains[p], strain, past, rates):
-            return False
-    return True
-
-
-@entry
-def differentiate(rod, module, station, steps, starts, strains, tension, load, ends, unit, tension_unit, blocks):
-    """Differentiate every segment's end by differences.
-
-    Arguments as in `carry`, with `ends` as it left them, the units of moments and tensions, and for output `blocks`
-    (P, 6 + m, 6 + m): rotation [rad], scaled moment and path lengths [m] at the end, by rotation and scaled moment at the
-    start and scaled tensions of the module's muscles.
-    """
-    rates = np.empty((rod.b.size, ends.shape[1]))
-    base, strain, past, forces = np.empty(6), np.empty(6), np.empty(6), tension.copy()
-    state = np.empty(ends.shape[1])
+    columns = tangents.shape[1]
+    ws = scratch(rod, columns)
+    tangents[:] = 0.0
+    for l in range(min(columns, 6)):
+        tangents[:, l, l] = 1.0
+    driven = np.arange(tension.size)
     for p in range(starts.shape[0]):
         k = module[p]
-        i0, mk = rod.first_muscle[k], rod.first_muscle[k + 1] - rod.first_muscle[k]
-        for j in range(6 + mk):
-            state[:STATE] = starts[p]
-            state[STATE:] = 0.0
-            if j < 3:
-                turn = (0.5 * DIFFERENCE * (j == 0), 0.5 * DIFFERENCE * (j == 1), 0.5 * DIFFERENCE * (j == 2))
-                state[0], state[1], state[2], state[3] = quaternion_turn(turn, (state[0], state[1], state[2], state[3]))
-            elif j < 6:
-                state[4 + j] += DIFFERENCE * unit
-            else:
-                forces[i0 + j - 6] += DIFFERENCE * tension_unit[i0 + j - 6]
-            base[:] = strains[p]
-            if not march(rod, k, station[p], steps[p], forces, load, state, base, strain, past, rates):
-                return False
-            if j >= 6:
-                forces[i0 + j - 6] = tension[i0 + j - 6]
-            # twice the vector part of q o q0^-1, for unit quaternions the rotation vector
-            a, b = state, ends[p]
-            scale = 2.0 / (DIFFERENCE * np.sqrt(np.sum(a[:4] * a[:4]) * np.sum(b[:4] * b[:4])))
-            blocks[p, 0, j] = scale * (a[1] * b[0] - a[0] * b[1] - a[2] * b[3] + a[3] * b[2])
-            blocks[p, 1, j] = scale * (a[2] * b[0] - a[0] * b[2] - a[3] * b[1] + a[1] * b[3])
-            blocks[p, 2, j] = scale * (a[3] * b[0] - a[0] * b[3] - a[1] * b[2] + a[2] * b[1])
-            for i in range(3):
-                blocks[p, 3 + i, j] = (a[7 + i] - b[7 + i]) / (unit * DIFFERENCE)
-            for i in range(mk):
-                blocks[p, 6 + i, j] = (a[STATE + i] - b[STATE + i]) / DIFFERENCE
+        driven[:] = 6 - rod.first_muscle[k] + np.arange(tension.size)
+        ends[p, :STATE] = starts[p]
+        ends[p, STATE:] = 0.0
+        if not march(rod, k, station[p], steps[p], tension, load, ends[p], strains[p], columns, driven, tangents[p], ws):
+            return False
     return True
 
 
@@ -197,11 +161,19 @@ class Guess:
         """Add a step of the scaled unknowns: moment at the base, then rotation and moment of each segment, then tensions."""
         count = len(self.starts)
         each = np.concatenate([np.zeros(3), step[: 6 * count - 3]]).reshape(count, 6)
-        for start, turn in zip(self.starts, each[:, :3], strict=True):
-            turned = Rotation.from_rotvec(turn) * Rotation.from_quat(start[:4], scalar_first=True)
-            start[:4] = turned.as_quat(scalar_first=True)
+        turned = Rotation.from_rotvec(each[:, :3]) * Rotation.from_quat(self.starts[:, :4], scalar_first=True)
+        self.starts[:, :4] = turned.as_quat(scalar_first=True)
         self.starts[:, 7:10] += cut.unit * each[:, 3:]
         self.tension += cut.tension_unit * step[6 * count - 3 :]
+
+
+def shoot(cut: Segments, guess: Guess, load: Array, columns: int = 0) -> tuple[Array, Array]:
+    """Return the segments' ends and, for so many columns, tangents, as of `carry`; NoReference where there are none."""
+    wide = cut.rod.route.shape[1]
+    ends, tangents = np.empty((len(cut.module), STATE + wide)), np.empty((len(cut.module), columns, 6 + wide))
+    if not carry(cut.rod, cut.module, cut.station, cut.steps, guess.starts, guess.strains, guess.tension, load, ends, tangents):
+        raise NoReference("a section has no strain that carries its wrench")
+    return ends, tangents
 
 
 def mismatch(cut: Segments, guess: Guess, state: State) -> tuple[Array, Array]:
@@ -211,10 +183,10 @@ def mismatch(cut: Segments, guess: Guess, state: State) -> tuple[Array, Array]:
     the tip less that applied, and the muscles' length mismatch over their rest lengths (tendons: tension over its unit).
     """
     rod, load = cut.rod, state.load
-    ends = np.empty((len(cut.module), STATE + rod.route.shape[1]))
-    if not carry(rod, cut.module, cut.station, cut.steps, guess.starts, guess.strains, guess.tension, load, ends):
-        raise NoReference("a section has no strain that carries its wrench")
-    met = Rotation.from_quat(ends[:-1, :4], scalar_first=True) * Rotation.from_quat(guess.starts[1:, :4], scalar_first=True).inv()
+    ends, _ = shoot(cut, guess, load)
+    met = (
+        Rotation.from_quat(ends[:-1, :4], scalar_first=True) * Rotation.from_quat(guess.starts[1:, :4], scalar_first=True).inv()
+    )
     joints = np.hstack([met.as_rotvec(), (ends[:-1, 7:10] - guess.starts[1:, 7:10]) / cut.unit])
     lever, weight = _payload(load, ends[-1])
     tip = (ends[-1, 7:10] - load[3:6] - np.cross(lever, weight)) / cut.unit
@@ -236,31 +208,27 @@ def _payload(load: Array, end: Array) -> tuple[Array, Array]:
     return pose(end[:4], end[4:7])[:3, :3] @ load[10:13], load[9] * load[6:9]
 
 
-def jacobian(cut: Segments, guess: Guess, state: State, ends: Array) -> Array:
+def jacobian(cut: Segments, guess: Guess, state: State) -> Array:
     """Return the derivative (N, N) of the residual in the unknowns, N = 6 P - 3 + n."""
     rod, load, count, n = cut.rod, state.load, len(cut.module), len(guess.tension)
-    wide = 6 + rod.route.shape[1]
-    blocks = np.zeros((count, wide, wide))
-    if not differentiate(
-        rod, cut.module, cut.station, cut.steps, guess.starts, guess.strains, guess.tension, load, ends,
-        cut.unit, cut.tension_unit, blocks,
-    ):  # fmt: skip
-        raise NoReference("a section has no strain that carries its wrench")
+    ends, tangents = shoot(cut, guess, load, 6 + rod.route.shape[1])
+    blocks = tangents.transpose(0, 2, 1)
+    blocks[:, 3:6] /= cut.unit
+    blocks[:, :, 3:6] *= cut.unit
     lever, weight = _payload(load, ends[-1])
-    # By the base's rotation as well: these three columns are left out below.
+    # By the base's rotation as well, and with the tip's among the rows: both are left out below.
     result = np.zeros((6 * count + n, 6 * count + n))
     for p, k in enumerate(cut.module):
-        i0, i1 = rod.first_muscle[k], rod.first_muscle[k + 1]
-        rows, muscles = slice(6 * p, 6 * p + 6), slice(6 * count + i0, 6 * count + i1)
-        result[rows, rows], result[rows, muscles] = blocks[p, :6, :6], blocks[p, :6, 6 : 6 + i1 - i0]
-        result[muscles, rows], inside = blocks[p, 6 : 6 + i1 - i0, :6], blocks[p, 6 : 6 + i1 - i0, 6 : 6 + i1 - i0]
-        result[muscles, muscles] += inside
+        i0, mk = rod.first_muscle[k], rod.first_muscle[k + 1] - rod.first_muscle[k]
+        here, muscles = slice(6 * p, 6 * p + 6), slice(6 * count + i0, 6 * count + i0 + mk)
+        by_tension = blocks[p, : 6 + mk, 6 : 6 + mk] * cut.tension_unit[i0 : i0 + mk]
+        result[here, here], result[here, muscles] = blocks[p, :6, :6], by_tension[:6]
+        result[muscles, here] = blocks[p, 6 : 6 + mk, :6]
+        result[muscles, muscles] += by_tension[6:]
         if p + 1 < count:
-            result[rows, 6 * p + 6 : 6 * p + 12] = -np.eye(6)
-        else:
-            turned, bent = result[rows][:3].copy(), result[rows][3:]
-            turning = (np.outer(lever, weight) - lever @ weight * np.eye(3)) / cut.unit
-            result[rows][3:] = bent - turning @ turned
+            result[here, 6 * p + 6 : 6 * p + 12] = -np.eye(6)
+    turned, bent = result[6 * count - 6 : 6 * count - 3], result[6 * count - 3 : 6 * count]
+    bent -= (np.outer(lever, weight) - lever @ weight * np.eye(3)) / cut.unit @ turned
     for i in range(n):
         row, rest, unit = result[6 * count + i], rod.rest_length[i], cut.tension_unit[i]
         if rod.kind[i] == TENDON:
@@ -270,8 +238,7 @@ def jacobian(cut: Segments, guess: Guess, state: State, ends: Array) -> Array:
             slope = elongation(rod.kind[i], rod.parameters, i, rest, guess.tension[i], state.drive[i])[1]
             row[6 * count + i] -= slope * unit
             row /= rest
-    keep = np.delete(np.arange(6 * count + n), slice(6 * count - 6, 6 * count - 3))  # the tip's rotation is free
-    return result[keep][:, 3:]
+    return np.delete(result, np.s_[6 * count - 6 : 6 * count - 3], axis=0)[:, 3:]
 
 
 def newton(cut: Segments, guess: Guess, state: State, factors: Any = None) -> tuple[float, Array, Any]:
@@ -283,7 +250,7 @@ def newton(cut: Segments, guess: Guess, state: State, factors: Any = None) -> tu
     size = float(np.abs(residual).max())
     for _ in range(MAX_ITERATIONS):
         if factors is None:
-            factors = lu_factor(jacobian(cut, guess, state, ends))
+            factors = lu_factor(jacobian(cut, guess, state))
         guess.move(cut, -lu_solve(factors, residual))
         before = size
         residual, ends = mismatch(cut, guess, state)

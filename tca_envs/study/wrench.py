@@ -36,9 +36,10 @@ from tca_envs.mechanics.algebra import (
     put3,
     quaternion_rate,
     rotation_matrix,
+    scalar_matrix,
     transpose,
 )
-from tca_envs.mechanics.collocation import PAYLOAD_MASS
+from tca_envs.mechanics.collocation import ORIGIN, PAYLOAD_MASS
 
 Array = NDArray[np.float64]
 
@@ -149,8 +150,27 @@ def wrench(module: Module, fraction: float, strain: Array, tension: Array) -> Ar
     return result
 
 
+class Scratch(NamedTuple):
+    """Arrays that `march` works with; C columns of the tangent."""
+
+    strain: Array  # (6,)
+    past: Array  # (6,)
+    pull: Array  # (m, 6) [r x t; t] of each muscle, body frame
+    rates: Array  # (S, STATE + m)
+    tangent_rates: Array  # (S, C, 6 + m)
+
+
+@inner
+def scratch(rod, columns):
+    """Return a `Scratch` for a tangent of so many columns."""
+    stages, m = rod.b.size, rod.route.shape[1]
+    return Scratch(
+        np.empty(6), np.empty(6), np.empty((m, 6)), np.empty((stages, STATE + m)), np.empty((stages, columns, 6 + m))
+    )
+
+
 @njit(forceinline=True, **INNER)  # a call would copy all of `rod`
-def settle(rod, k, station, tension, moment, force, strain, stretch):
+def settle(rod, k, station, tension, moment, force, strain, stretch, pull):
     """Find the strain that carries a wrench, by Newton, in place.
 
     The muscles' forces derive from sum F_i |p_i'|, so with B = [-[r], 1] and c = [r x t; t] the derivative is
@@ -170,48 +190,53 @@ def settle(rod, k, station, tension, moment, force, strain, stretch):
         In: first guess; out: the strain, where there is one.
     stretch : (>= m,) array
         Out: |p_i'| of the module's muscles.
+    pull : (m, 6) array
+        Out: their c.
 
     Returns
     -------
-    bool
-        Whether Newton got there.
+    tuple
+        Whether Newton got there; H_vv^-1; H_uv H_vv^-1; (H_uu - H_uv H_vv^-1 H_vu)^-1: with them, H x = y is solved.
     """
     stiffness, reference, route, length = rod.stiffness, rod.reference, rod.route, rod.length[k]
     i0, mk = rod.first_muscle[k], rod.first_muscle[k + 1] - rod.first_muscle[k]
     u, v = (strain[0], strain[1], strain[2]), (strain[3], strain[4], strain[5])
     ku, kv = get3(stiffness, k, 0), get3(stiffness, k, 3)
     u0, v0 = get3(reference, k, 0), get3(reference, k, 3)
+    flexibility = gain = softness = scalar_matrix(0.0)
     for _ in range(MAX_SETTLE):
         ru = (ku[0] * (u[0] - u0[0]) - moment[0], ku[1] * (u[1] - u0[1]) - moment[1], ku[2] * (u[2] - u0[2]) - moment[2])
         rv = (kv[0] * (v[0] - v0[0]) - force[0], kv[1] * (v[1] - v0[1]) - force[1], kv[2] * (v[2] - v0[2]) - force[2])
         uu = (ku[0], 0.0, 0.0, 0.0, ku[1], 0.0, 0.0, 0.0, ku[2])
         vv = (kv[0], 0.0, 0.0, 0.0, kv[1], 0.0, 0.0, 0.0, kv[2])
-        uv = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        uv = scalar_matrix(0.0)
         for c in range(mk):
             x, y = route[station, c, 0], route[station, c, 1]
             t = (v[0] - u[2] * y + route[station, c, 2], v[1] + u[2] * x + route[station, c, 3], v[2] + u[0] * y - u[1] * x)
             norm = np.sqrt(dot(t, t))
             if not norm > 1e-9:
-                return False
-            t = axpy(1.0 / norm, t, (0.0, 0.0, 0.0))
+                return False, flexibility, gain, softness
+            t = axpy(1.0 / norm, t, ORIGIN)
             lever = (y * t[2], -x * t[2], x * t[1] - y * t[0])
             f = tension[i0 + c]
             ru, rv = axpy(f, lever, ru), axpy(f, t, rv)
             g = f / norm
-            uu = axpy9(g, axpy9(-1.0, outer(lever, lever), (y * y, -x * y, 0.0, -x * y, x * x, 0.0, 0.0, 0.0, x * x + y * y)), uu)
+            uu = axpy9(
+                g, axpy9(-1.0, outer(lever, lever), (y * y, -x * y, 0.0, -x * y, x * x, 0.0, 0.0, 0.0, x * x + y * y)), uu
+            )
             uv = axpy9(g, axpy9(-1.0, outer(lever, t), (0.0, 0.0, y, 0.0, 0.0, -x, -y, x, 0.0)), uv)
-            vv = axpy9(g, axpy9(-1.0, outer(t, t), (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)), vv)
+            vv = axpy9(g, axpy9(-1.0, outer(t, t), scalar_matrix(1.0)), vv)
         worst = max(
             length * max(abs(ru[0] / ku[0]), abs(ru[1] / ku[1]), abs(ru[2] / ku[2])),
             max(abs(rv[0] / kv[0]), abs(rv[1] / kv[1]), abs(rv[2] / kv[2])),
         )
         if not worst < 1e6:
-            return False
+            return False, flexibility, gain, softness
         flexibility = inverse(vv)
         gain = matmul(uv, flexibility)
-        bend = apply(inverse(axpy9(-1.0, matmul(gain, transpose(uv)), uu)), axpy(-1.0, ru, apply(gain, rv)))
-        shear = apply(flexibility, axpy(-1.0, rv, axpy(-1.0, apply_transposed(uv, bend), (0.0, 0.0, 0.0))))
-        u, v = axpy(1.0, bend, u), axpy(1.0, shear, v)
+        softness = inverse(axpy9(-1.0, matmul(gain, transpose(uv)), uu))
+        bend, shear = carried(flexibility, gain, softness, ru, rv)
+        u, v = axpy(-1.0, bend, u), axpy(-1.0, shear, v)
         if worst < rod.settled:
             strain[0], strain[1], strain[2] = u
             strain[3], strain[4], strain[5] = v
@@ -220,13 +245,27 @@ def settle(rod, k, station, tension, moment, force, strain, stretch):
                 x, y = route[station, c, 0], route[station, c, 1]
                 t = (v[0] - u[2] * y + route[station, c, 2], v[1] + u[2] * x + route[station, c, 3], v[2] + u[0] * y - u[1] * x)
                 stretch[c] = np.sqrt(dot(t, t))
-            return True
-    return False
+                t = axpy(1.0 / stretch[c], t, ORIGIN)
+                put3(pull, c, 0, (y * t[2], -x * t[2], x * t[1] - y * t[0]))
+                put3(pull, c, 3, t)
+            return True, flexibility, gain, softness
+    return False, flexibility, gain, softness
+
+
+@njit(forceinline=True, **INNER)
+def carried(flexibility, gain, softness, moment, force):
+    """Return the change of bend and shear (u, v) that goes with a change of the wrench, from the factors of `settle`."""
+    bend = apply(softness, axpy(-1.0, apply(gain, force), moment))
+    return bend, axpy(-1.0, apply_transposed(gain, bend), apply(flexibility, force))
 
 
 @inner
-def march(rod, k, station, steps, tension, load, state, base, strain, past, rates):
+def march(rod, k, station, steps, tension, load, state, base, columns, driven, tangent, ws):
     """Integrate over steps of one module, in place.
+
+    The tangent is that of the differential equations, integrated along: for a change of the rotation by phi and of the moment
+    by dm, and for changes dF of tensions, phi' = R du, dm' = n x dp' with dp' = phi x p' + R dv, and H [du; dv] is the change of
+    the wrench, [R^T (dm - phi x m); -R^T (phi x n)], less dF c.
 
     Parameters
     ----------
@@ -242,9 +281,13 @@ def march(rod, k, station, steps, tension, load, state, base, strain, past, rate
         State at the first station; out: that after the steps.
     base : (6,) array
         Near the strain at the first station; out: that strain.
-    strain, past : (6,) arrays
-        Scratch.
-    rates : (S, STATE + m) array
+    columns : int
+        So many rows of `tangent` are wanted, from the first one; 0 for no tangent.
+    driven : (n,) array
+        The row of the tangent that belongs to each tension; -1 for none.
+    tangent : (C, 6 + m) array
+        Changes of rotation, moment and path lengths, which go with a unit of something; out: those after the steps.
+    ws : Scratch
         Scratch.
 
     Returns
@@ -252,8 +295,8 @@ def march(rod, k, station, steps, tension, load, state, base, strain, past, rate
     bool
         False where a section has no strain that carries its wrench.
     """
-    a, b = rod.a, rod.b
-    mk = rod.first_muscle[k + 1] - rod.first_muscle[k]
+    a, b, strain, past, rates, tangent_rates = rod.a, rod.b, ws.strain, ws.past, ws.rates, ws.tangent_rates
+    i0, mk = rod.first_muscle[k], rod.first_muscle[k + 1] - rod.first_muscle[k]
     h = rod.length[k] / rod.steps[k]
     gravity = (load[6], load[7], load[8])
     tip_force = (load[0], load[1], load[2])
@@ -285,9 +328,10 @@ def march(rod, k, station, steps, tension, load, state, base, strain, past, rate
                     past[l] = now
             n = axpy(load[PAYLOAD_MASS] + rod.mass_below[station], gravity, tip_force)
             r = rotation_matrix(q)
-            if not settle(
-                rod, k, station, tension, apply_transposed(r, m), apply_transposed(r, n), strain, rates[i, STATE:]
-            ):
+            ok, flexibility, gain, softness = settle(
+                rod, k, station, tension, apply_transposed(r, m), apply_transposed(r, n), strain, rates[i, STATE:], ws.pull
+            )
+            if not ok:
                 return False
             if step == 0 and i == 0:
                 for l in range(6):
@@ -298,15 +342,43 @@ def march(rod, k, station, steps, tension, load, state, base, strain, past, rate
             )
             put3(rates, i, 4, t)
             put3(rates, i, 7, cross(n, t))
+            for l in range(columns):
+                phi, dm = get3(tangent, l, 0), get3(tangent, l, 3)
+                for j in range(i):
+                    d = h * a[i, j]
+                    if d != 0.0:
+                        phi = axpy(d, (tangent_rates[j, l, 0], tangent_rates[j, l, 1], tangent_rates[j, l, 2]), phi)
+                        dm = axpy(d, (tangent_rates[j, l, 3], tangent_rates[j, l, 4], tangent_rates[j, l, 5]), dm)
+                moment = apply_transposed(r, axpy(-1.0, cross(phi, m), dm))
+                force = apply_transposed(r, cross(n, phi))
+                for c in range(mk):
+                    if driven[i0 + c] == l:
+                        moment = axpy(-1.0, get3(ws.pull, c, 0), moment)
+                        force = axpy(-1.0, get3(ws.pull, c, 3), force)
+                bend, shear = carried(flexibility, gain, softness, moment, force)
+                put3(tangent_rates[i], l, 0, apply(r, bend))
+                put3(tangent_rates[i], l, 3, cross(n, axpy(1.0, cross(phi, t), apply(r, shear))))
+                for c in range(mk):
+                    tangent_rates[i, l, 6 + c] = dot(get3(ws.pull, c, 0), bend) + dot(get3(ws.pull, c, 3), shear)
             station += 1
         for i in range(b.size):
             for l in range(STATE + mk):
                 state[l] += h * b[i] * rates[i, l]
+            for l in range(columns):
+                for c in range(6 + mk):
+                    tangent[l, c] += h * b[i] * tangent_rates[i, l, c]
     return True
 
 
 @inner
 def tip_moment(load, r):
     """Return the moment at the tip from the external load, in the base frame [N m]; r is the tip's rotation matrix."""
-    weight = axpy(load[PAYLOAD_MASS], (load[6], load[7], load[8]), (0.0, 0.0, 0.0))
+    weight = axpy(load[PAYLOAD_MASS], (load[6], load[7], load[8]), ORIGIN)
     return axpy(1.0, cross(apply(r, (load[10], load[11], load[12])), weight), (load[3], load[4], load[5]))
+
+
+@inner
+def tip_moment_turned(load, r, phi):
+    """Return the change of `tip_moment` as the tip turns by phi."""
+    weight = axpy(load[PAYLOAD_MASS], (load[6], load[7], load[8]), ORIGIN)
+    return cross(cross(phi, apply(r, (load[10], load[11], load[12]))), weight)

@@ -19,12 +19,22 @@ from tca_envs.mechanics.algebra import entry, inner, rotation_matrix
 from tca_envs.mechanics.muscle import TENDON, elongation
 from tca_envs.mechanics.shooting import tension_units
 from tca_envs.study.method import Answer, Method, State
-from tca_envs.study.wrench import RK4, STATE, Rod, march, moment_unit, rod, tip_moment, wrench
+from tca_envs.study.wrench import (
+    RK4,
+    STATE,
+    Rod,
+    Scratch,
+    march,
+    moment_unit,
+    rod,
+    scratch,
+    tip_moment,
+    tip_moment_turned,
+    wrench,
+)
 
 Array = NDArray[np.float64]
 
-DIFFERENCE = 1e-6
-"""Difference step of the scaled unknowns."""
 SETTLED = 0.02
 """Dimensionless imbalance of a section below which its strain is accepted."""
 SERVES = 0.5
@@ -56,36 +66,42 @@ class Guess(NamedTuple):
     """The same."""
 
 
-class Scratch(NamedTuple):
+class Problem(NamedTuple):
+    """What stays the same from solve to solve."""
+
+    rod: Rod
+    driven: NDArray[np.int64]  # (n,) the unknown that is the tension of each muscle; -1 for a tendon
+    unit: Array  # (N,) units of the unknowns: moment at the base [N m], tensions [N]
+
+
+class Work(NamedTuple):
     """Arrays that the kernels share."""
 
     state: Array  # (STATE + m,)
-    rates: Array  # (S, STATE + m)
-    strain: Array  # (6,)
-    past: Array  # (6,)
     tension: Array  # (n,) [N]
+    tangent: Array  # (N, 6 + m)
+    matrix: Array  # (N, N) Jacobian
+    march: Scratch
 
 
 @inner
-def shoot(rod, free, unit, x, drive, load, starts, scratch, residual):
+def shoot(problem, x, drive, load, starts, differentiate, work, residual):
     """Integrate from base to tip.
 
     Parameters
     ----------
-    rod : Rod
+    problem : Problem
         The arm.
-    free : (N - 3,) array
-        The muscles whose tensions are unknown.
-    unit : (N,) array
-        Units of the unknowns.
     x : (N,) array
         Moment at the base and tensions, over their units.
     drive, load : (n,), (LOAD,) arrays
         Drives and external load.
     starts : (M, 6) array
         Near the strains at the modules' bases; out: those.
-    scratch : Scratch
-        Out: state at the tip, tensions.
+    differentiate : bool
+        Whether to set the Jacobian.
+    work : Work
+        Out: state at the tip, tensions and, where it is asked for, the Jacobian.
     residual : (N,) array
         Out: moment at the tip less that applied, over its unit; length mismatch of the muscles over their rest lengths.
 
@@ -94,34 +110,54 @@ def shoot(rod, free, unit, x, drive, load, starts, scratch, residual):
     float
         Norm of the residual; inf where there is no answer.
     """
-    state, tension = scratch.state, scratch.tension
+    rod, driven, unit = problem
+    state, tension, tangent, matrix = work.state, work.tension, work.tangent, work.matrix
     for i in range(tension.size):
-        tension[i] = drive[i]  # that of a tendon
-    for j in range(free.size):
-        tension[free[j]] = unit[3 + j] * x[3 + j]
+        tension[i] = drive[i] if driven[i] < 0 else unit[driven[i]] * x[driven[i]]
     state[:] = 0.0
     state[0] = 1.0
     for i in range(3):
         state[7 + i] = unit[i] * x[i]
-    station, row = 0, 3
+    columns = 0
+    if differentiate:
+        tangent[:] = 0.0
+        for i in range(3):
+            tangent[i, 3 + i] = 1.0
+        columns = 3
+    station = 0
     for k in range(rod.steps.size):
         i0, i1 = rod.first_muscle[k], rod.first_muscle[k + 1]
         state[STATE:] = 0.0
-        if not march(rod, k, station, rod.steps[k], tension, load, state, starts[k], scratch.strain, scratch.past, scratch.rates):
+        if differentiate:
+            tangent[:, 6:] = 0.0
+            for i in range(i0, i1):
+                columns = max(columns, driven[i] + 1)
+        if not march(rod, k, station, rod.steps[k], tension, load, state, starts[k], columns, driven, tangent, work.march):
             return np.inf
         station += rod.steps[k] * rod.b.size
         for i in range(i0, i1):
-            if rod.kind[i] != TENDON:
-                rest = rod.rest_length[i]
-                delta, _, _ = elongation(rod.kind[i], rod.parameters, i, rest, tension[i], drive[i])
-                residual[row] = (state[STATE + i - i0] - rest - delta) / rest
-                row += 1
-    moment = tip_moment(load, rotation_matrix((state[0], state[1], state[2], state[3])))
+            row = driven[i]
+            if row < 0:
+                continue
+            rest = rod.rest_length[i]
+            delta, softness, _ = elongation(rod.kind[i], rod.parameters, i, rest, tension[i], drive[i])
+            residual[row] = (state[STATE + i - i0] - rest - delta) / rest
+            if differentiate:
+                for j in range(unit.size):
+                    matrix[row, j] = tangent[j, 6 + i - i0] * unit[j] / rest
+                matrix[row, row] -= softness * unit[row] / rest
+    r = rotation_matrix((state[0], state[1], state[2], state[3]))
+    moment = tip_moment(load, r)
     total = 0.0
     for i in range(3):
         residual[i] = (state[7 + i] - moment[i]) / unit[i]
     for i in range(residual.size):
         total += residual[i] * residual[i]
+    if differentiate:
+        for j in range(unit.size):
+            moment = tip_moment_turned(load, r, (tangent[j, 0], tangent[j, 1], tangent[j, 2]))
+            for i in range(3):
+                matrix[i, j] = (tangent[j, 3 + i] - moment[i]) * unit[j] / unit[i]
     return np.sqrt(total) if total < np.inf else np.inf
 
 
@@ -156,21 +192,6 @@ def invert(matrix, inverse):
 
 
 @inner
-def differentiate(rod, free, unit, x, drive, load, starts, scratch, residual, moved, matrix, inverse):
-    """Set `inverse` to the inverse of the Jacobian at x, by differences; False where it has none."""
-    for j in range(x.size):
-        keep = x[j]
-        x[j] += DIFFERENCE
-        size = shoot(rod, free, unit, x, drive, load, starts, scratch, moved)
-        x[j] = keep
-        if not size < np.inf:
-            return False
-        for i in range(x.size):
-            matrix[i, j] = (moved[i] - residual[i]) / DIFFERENCE
-    return invert(matrix, inverse)
-
-
-@inner
 def update(inverse, step, change, product):
     """Let the inverse Jacobian map `change` of the residual to `step`, by Broyden's formula."""
     n = step.size
@@ -193,20 +214,22 @@ def update(inverse, step, change, product):
 
 
 @inner
-def newton(rod, free, unit, x, drive, load, starts, inverse, tolerance, scratch):
+def newton(problem, x, drive, load, starts, inverse, tolerance, work):
     """Solve by Newton from x, in place; whether it got there."""
     n = x.size
     residual, moved, step, trial = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    matrix = np.empty((n, n))
-    size = shoot(rod, free, unit, x, drive, load, starts, scratch, residual)
     known = inverse[0, 0] != 0.0 or inverse[0, 1] != 0.0 or inverse[0, 2] != 0.0
-    new = False
+    size = shoot(problem, x, drive, load, starts, not known, work, residual)
+    there, new = not known, False  # whether the Jacobian at x is at hand; whether `inverse` is its inverse
     spent = 1
     while size < np.inf and spent < MAX_INTEGRATIONS:
         if size < tolerance:
             return True
         if not known:
-            if not differentiate(rod, free, unit, x, drive, load, starts, scratch, residual, moved, matrix, inverse):
+            if not there:
+                shoot(problem, x, drive, load, starts, True, work, residual)
+                spent += 1
+            if not invert(work.matrix, inverse):
                 return False
             known = new = True
         longest = 0.0
@@ -221,7 +244,7 @@ def newton(rod, free, unit, x, drive, load, starts, inverse, tolerance, scratch)
         for _ in range(HALVINGS if new else 1):
             for i in range(n):
                 trial[i] = x[i] + part * step[i]
-            trial_size = shoot(rod, free, unit, trial, drive, load, starts, scratch, moved)
+            trial_size = shoot(problem, trial, drive, load, starts, False, work, moved)
             spent += 1
             if trial_size < (1.0 - 0.1 * part) * size:
                 break
@@ -232,7 +255,7 @@ def newton(rod, free, unit, x, drive, load, starts, inverse, tolerance, scratch)
             known = False
             continue
         known = trial_size < SERVES * size
-        new = False
+        there = new = False
         for i in range(n):
             step[i] = trial[i] - x[i]
             moved[i] -= residual[i]
@@ -244,13 +267,13 @@ def newton(rod, free, unit, x, drive, load, starts, inverse, tolerance, scratch)
 
 
 @entry
-def solve(rod, free, unit, moment, tension, starts, inverse, from_drive, from_load, drive, load, tolerance, tip):
+def solve(problem, moment, tension, starts, inverse, from_drive, from_load, drive, load, tolerance, tip):
     """Find the equilibrium that continues a known one.
 
     Parameters
     ----------
-    rod, free, unit
-        As of `shoot`.
+    problem : Problem
+        The arm.
     moment, tension, starts, inverse : arrays
         In: as in `Guess`; out: those of the answer.
     from_drive, from_load : (n,), (LOAD,) arrays
@@ -267,13 +290,15 @@ def solve(rod, free, unit, moment, tension, starts, inverse, from_drive, from_lo
     bool
         Whether there is an answer.
     """
-    wide = STATE + rod.route.shape[1]
-    scratch = Scratch(np.empty(wide), np.empty((rod.b.size, wide)), np.empty(6), np.empty(6), np.empty(tension.size))
-    x = np.empty(unit.size)
+    rod, driven, unit = problem
+    n, m = unit.size, rod.route.shape[1]
+    work = Work(np.empty(STATE + m), tension.copy(), np.empty((n, 6 + m)), np.empty((n, n)), scratch(rod, n))
+    x = np.empty(n)
     for i in range(3):
         x[i] = moment[i] / unit[i]
-    for j in range(free.size):
-        x[3 + j] = tension[free[j]] / unit[3 + j]
+    for i in range(tension.size):
+        if driven[i] >= 0:
+            x[driven[i]] = tension[i] / unit[driven[i]]
     good_x, good_starts, good_inverse = x.copy(), starts.copy(), inverse.copy()
     drive_now, load_now = drive.copy(), load.copy()
     done, substep = 0.0, 1.0
@@ -283,7 +308,7 @@ def solve(rod, free, unit, moment, tension, starts, inverse, from_drive, from_lo
             drive_now[i] = drive[i] if here == 1.0 else from_drive[i] + here * (drive[i] - from_drive[i])
         for i in range(load.size):
             load_now[i] = load[i] if here == 1.0 else from_load[i] + here * (load[i] - from_load[i])
-        if newton(rod, free, unit, x, drive_now, load_now, starts, inverse, tolerance, scratch):
+        if newton(problem, x, drive_now, load_now, starts, inverse, tolerance, work):
             if here == 1.0:
                 break
             done, substep = here, 2.0 * substep
@@ -295,8 +320,8 @@ def solve(rod, free, unit, moment, tension, starts, inverse, from_drive, from_lo
         return False
     for i in range(3):
         moment[i] = unit[i] * x[i]
-    tension[:] = scratch.tension
-    state = scratch.state
+    tension[:] = work.tension
+    state = work.state
     r = rotation_matrix((state[0], state[1], state[2], state[3]))
     for i in range(3):
         for j in range(3):
@@ -309,32 +334,28 @@ class WrenchShooting(NamedTuple):
     """The method made ready for one arm."""
 
     arm: Arm
-    rod: Rod
-    free: NDArray[np.int64]
-    unit: Array
+    problem: Problem
     tolerance: float
 
     def cold(self) -> Guess:
         """Return the unloaded arm."""
         _, tension, drive, load = self.arm.unloaded()
-        n = len(self.unit)
-        return Guess(np.zeros(3), tension, self.rod.reference.copy(), np.zeros((n, n)), drive, load)
+        n = len(self.problem.unit)
+        return Guess(np.zeros(3), tension, self.problem.rod.reference.copy(), np.zeros((n, n)), drive, load)
 
     def near(self, known: Equilibrium, state: State) -> Guess:
         """Return the moment at the base and the tensions of a known equilibrium."""
-        strain = known.strain(np.concatenate([[0.0], np.cumsum(self.rod.length)[:-1]]))
+        strain = known.strain(np.concatenate([[0.0], np.cumsum(self.problem.rod.length)[:-1]]))
         first = self.arm.modules[0]
         moment = wrench(first, 0.0, strain[0], known.tensions[: len(first.muscles)])[:3]
-        n = len(self.unit)
+        n = len(self.problem.unit)
         return Guess(moment, known.tensions, strain, np.zeros((n, n)), *known.known)
 
     def solve(self, state: State, guess: Guess) -> Answer:
         """Solve for the equilibrium at `state`."""
         drive, load, tip = state.drive, state.load, np.eye(4)
         found = Guess(*(x.copy() for x in guess[:4]), drive, load)
-        converged = solve(
-            self.rod, self.free, self.unit, *found[:4], guess.drive, guess.load, drive, load, self.tolerance, tip
-        )
+        converged = solve(self.problem, *found[:4], guess.drive, guess.load, drive, load, self.tolerance, tip)
         return Answer(converged, tip, found if converged else None)
 
 
@@ -347,9 +368,10 @@ def module_steps(module: Module, steps: int) -> int:
 def build(arm: Arm, steps: int, states: Sequence[State]) -> WrenchShooting:
     """Return the solver for a number of steps in each module, see `module_steps`."""
     made = rod(arm, RK4, [module_steps(module, steps) for module in arm.modules], SETTLED / steps**2)
-    free = np.flatnonzero(made.kind != TENDON)
+    free = made.kind != TENDON
+    driven = np.where(free, 2 + np.cumsum(free), -1)
     unit = np.concatenate([np.full(3, moment_unit(arm)), tension_units(arm)[free]])
-    return WrenchShooting(arm, made, free, unit, 1e-9)
+    return WrenchShooting(arm, Problem(made, driven, unit), 1e-9)
 
 
 METHOD = Method("wrench shooting, RK4", "steps", (2, 4, 8, 16, 32, 64), build)
