@@ -37,7 +37,9 @@ Array = NDArray[np.float64]
 
 SETTLED = 0.02
 """Dimensionless imbalance of a section below which its strain is accepted."""
-SERVES = 0.5
+TOLERANCE = 1e-4
+"""Norm of the residual that is an answer, times steps^4: a hundredth of the error of the integration, or less."""
+SERVES = 0.3
 """An old Jacobian serves as long as a step shrinks the residual to less than this."""
 MAX_STEP = 1.0
 """Longest Newton step of the scaled unknowns."""
@@ -45,7 +47,8 @@ HALVINGS = 6
 MAX_INTEGRATIONS = 60
 """Of one Newton, but for those of Jacobians."""
 SMALLEST_SUBSTEP = 1.0 / 64.0
-STEPS_PER_TURN = 0.5
+MAX_SUBSTEPS = 40
+STEPS_PER_TURN = 0.4
 """Steps for each turn of a helical muscle, over those of a module without: the two kinds of module then err alike."""
 
 
@@ -302,7 +305,7 @@ def solve(problem, moment, tension, starts, inverse, from_drive, from_load, driv
     good_x, good_starts, good_inverse = x.copy(), starts.copy(), inverse.copy()
     drive_now, load_now = drive.copy(), load.copy()
     done, substep = 0.0, 1.0
-    while substep >= SMALLEST_SUBSTEP:
+    for _ in range(MAX_SUBSTEPS):
         here = min(1.0, done + substep)
         for i in range(drive.size):
             drive_now[i] = drive[i] if here == 1.0 else from_drive[i] + here * (drive[i] - from_drive[i])
@@ -310,13 +313,16 @@ def solve(problem, moment, tension, starts, inverse, from_drive, from_load, driv
             load_now[i] = load[i] if here == 1.0 else from_load[i] + here * (load[i] - from_load[i])
         if newton(problem, x, drive_now, load_now, starts, inverse, tolerance, work):
             if here == 1.0:
+                done = 1.0
                 break
             done, substep = here, 2.0 * substep
             good_x[:], good_starts[:], good_inverse[:] = x, starts, inverse
         else:
             substep *= 0.25 if substep == 1.0 else 0.5
+            if substep < SMALLEST_SUBSTEP:
+                break
             x[:], starts[:], inverse[:] = good_x, good_starts, good_inverse
-    if substep < SMALLEST_SUBSTEP:
+    if done < 1.0:
         return False
     for i in range(3):
         moment[i] = unit[i] * x[i]
@@ -371,7 +377,7 @@ def build(arm: Arm, steps: int, states: Sequence[State]) -> WrenchShooting:
     free = made.kind != TENDON
     driven = np.where(free, 2 + np.cumsum(free), -1)
     unit = np.concatenate([np.full(3, moment_unit(arm)), tension_units(arm)[free]])
-    return WrenchShooting(arm, Problem(made, driven, unit), 1e-9)
+    return WrenchShooting(arm, Problem(made, driven, unit), max(TOLERANCE / steps**4, 1e-11))
 
 
 METHOD = Method("wrench shooting, RK4", "steps", (2, 4, 8, 16, 32, 64), build)
