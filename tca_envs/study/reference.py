@@ -9,11 +9,10 @@ no longer moves. It shares arm and muscle laws with `Arm.equilibrium` and no num
 from dataclasses import dataclass
 from functools import lru_cache
 from math import ceil
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lu_factor, lu_solve
 from scipy.spatial.transform import Rotation
 
 from tca_envs.mechanics import Arm, Equilibrium, Module
@@ -241,24 +240,27 @@ def jacobian(cut: Segments, guess: Guess, state: State) -> Array:
     return np.delete(result, np.s_[6 * count - 6 : 6 * count - 3], axis=0)[:, 3:]
 
 
-def newton(cut: Segments, guess: Guess, state: State, factors: Any = None) -> tuple[float, Array, Any]:
-    """Move `guess` to the equilibrium; return the largest residual, the segments' ends and the factors of the Jacobian.
+def newton(cut: Segments, guess: Guess, state: State, inverse: Array | None) -> tuple[float, Array, Array | None]:
+    """Move `guess` to the equilibrium; return the largest residual, the segments' ends and the inverse Jacobian.
 
-    Old `factors` serve as long as they help. Raises NoReference where it does not come to round-off.
+    An old `inverse` serves as long as it helps. Raises NoReference where it does not come to round-off.
     """
     residual, ends = mismatch(cut, guess, state)
     size = float(np.abs(residual).max())
     for _ in range(MAX_ITERATIONS):
-        if factors is None:
-            factors = lu_factor(jacobian(cut, guess, state))
-        guess.move(cut, -lu_solve(factors, residual))
+        if inverse is None:
+            try:
+                inverse = np.asarray(np.linalg.inv(jacobian(cut, guess, state)), dtype=np.float64)
+            except np.linalg.LinAlgError:
+                raise NoReference("Newton met a singular Jacobian") from None
+        guess.move(cut, -(inverse @ residual))
         before = size
         residual, ends = mismatch(cut, guess, state)
         size = float(np.abs(residual).max())
         if size < CLEAN or CONTRACTION * before < size < ROUND_OFF:
-            return size, ends, factors
+            return size, ends, inverse
         if not size < CONTRACTION * before:
-            factors = None
+            inverse = None
     raise NoReference(f"Newton stopped at a residual of {size:.1e}")
 
 
@@ -293,13 +295,11 @@ def reference(state: State, near: Equilibrium) -> Reference:
     for p, (k, module) in enumerate(zip(cut.module, modules, strict=True)):
         tension = near.tensions[cut.rod.first_muscle[k] : cut.rod.first_muscle[k + 1]]
         starts[p, 7:10] = poses[p, :3, :3] @ wrench(module, fraction[p], strains[p], tension)[:3]
-    guess, factors, tip, last = Guess(starts, strains, near.tensions.copy()), None, np.eye(4), None
+    guess, inverse, last = Guess(starts, strains, near.tensions.copy()), None, near.tip_pose[:3, 3]
     for doubling in range(DOUBLINGS + 1):
-        residual, ends, factors = newton(segments(arm, doubling), guess, state, factors)
+        residual, ends, inverse = newton(segments(arm, doubling), guess, state, inverse)
         tip = pose(ends[-1, :4], ends[:, 4:7].sum(axis=0))
-        error = np.inf if last is None else float(np.linalg.norm(tip[:3, 3] - last))
-        last = tip[:3, 3]
-        if error < STILL * arm.length:
-            moved = float(np.linalg.norm(last - near.tip_pose[:3, 3]))
-            return Reference(tip, guess.tension, residual, error, moved)
+        error, last = float(np.linalg.norm(tip[:3, 3] - last)), tip[:3, 3]
+        if doubling > 0 and error < STILL * arm.length:
+            return Reference(tip, guess.tension, residual, error, float(np.linalg.norm(last - near.tip_pose[:3, 3])))
     raise NoReference(f"twice as many steps still move the tip by {error:.1e} m")

@@ -263,9 +263,9 @@ def carried(flexibility, gain, softness, moment, force):
 def march(rod, k, station, steps, tension, load, state, base, columns, driven, tangent, ws):
     """Integrate over steps of one module, in place.
 
-    The tangent is that of the differential equations, integrated along: for a change of the rotation by phi and of the moment
-    by dm, and for changes dF of tensions, phi' = R du, dm' = n x dp' with dp' = phi x p' + R dv, and H [du; dv] is the change of
-    the wrench, [R^T (dm - phi x m); -R^T (phi x n)], less dF c.
+    The tangent is that of the differential equations, integrated along: where the rotation changes by phi, the moment by dm and
+    tensions by dF, phi' = R du and dm' = n x dp' with dp' = phi x p' + R dv, and H [du; dv] is the change of the wrench,
+    [R^T (dm - phi x m); R^T (n x phi)], less dF c.
 
     Parameters
     ----------

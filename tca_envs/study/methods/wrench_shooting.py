@@ -45,7 +45,7 @@ MAX_STEP = 1.0
 """Longest Newton step of the scaled unknowns."""
 HALVINGS = 6
 MAX_INTEGRATIONS = 60
-"""Of one Newton, but for those of Jacobians."""
+"""Of one Newton."""
 SMALLEST_SUBSTEP = 1.0 / 64.0
 MAX_SUBSTEPS = 40
 STEPS_PER_TURN = 0.4
@@ -218,20 +218,49 @@ def update(inverse, step, change, product):
 
 @inner
 def newton(problem, x, drive, load, starts, inverse, tolerance, work):
-    """Solve by Newton from x, in place; whether it got there."""
+    """Solve by Newton from x, in place; whether it got there.
+
+    There is one call of `shoot` for all this, because the compiler inlines every call.
+    """
     n = x.size
-    residual, moved, step, trial = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    residual, moved, step, trial = np.empty(n), np.empty(n), np.empty(n), x.copy()
     known = inverse[0, 0] != 0.0 or inverse[0, 1] != 0.0 or inverse[0, 2] != 0.0
-    size = shoot(problem, x, drive, load, starts, not known, work, residual)
-    there, new = not known, False  # whether the Jacobian at x is at hand; whether `inverse` is its inverse
-    spent = 1
-    while size < np.inf and spent < MAX_INTEGRATIONS:
+    new = False  # whether `inverse` is that of the Jacobian at x
+    size, part, halvings = np.inf, 0.0, 0  # part 0: the trial is x itself
+    for _ in range(MAX_INTEGRATIONS):
+        trial_size = shoot(problem, trial, drive, load, starts, not known, work, moved)
+        if part == 0.0:
+            size = trial_size
+            residual[:] = moved
+            if not size < np.inf:
+                return False
+        elif trial_size < (1.0 - 0.1 * part) * size:
+            known = trial_size < SERVES * size
+            for i in range(n):
+                step[i] = trial[i] - x[i]
+                moved[i] -= residual[i]
+                residual[i] += moved[i]
+                x[i] = trial[i]
+            update(inverse, step, moved, trial)
+            size = trial_size
+            new = False
+        elif new:
+            part *= 0.5
+            halvings += 1
+            if halvings == HALVINGS:
+                return False
+            for i in range(n):
+                trial[i] = x[i] + part * step[i]
+            continue
+        else:
+            known = False
         if size < tolerance:
             return True
         if not known:
-            if not there:
-                shoot(problem, x, drive, load, starts, True, work, residual)
-                spent += 1
+            if part != 0.0:
+                trial[:] = x
+                part = 0.0
+                continue
             if not invert(work.matrix, inverse):
                 return False
             known = new = True
@@ -243,29 +272,9 @@ def newton(problem, x, drive, load, starts, inverse, tolerance, work):
             longest = max(longest, abs(step[i]))
         if not longest < np.inf:
             return False
-        part = min(1.0, MAX_STEP / max(longest, 1e-300))
-        for _ in range(HALVINGS if new else 1):
-            for i in range(n):
-                trial[i] = x[i] + part * step[i]
-            trial_size = shoot(problem, trial, drive, load, starts, False, work, moved)
-            spent += 1
-            if trial_size < (1.0 - 0.1 * part) * size:
-                break
-            part *= 0.5
-        else:
-            if new:
-                return False
-            known = False
-            continue
-        known = trial_size < SERVES * size
-        there = new = False
+        part, halvings = min(1.0, MAX_STEP / max(longest, 1e-300)), 0
         for i in range(n):
-            step[i] = trial[i] - x[i]
-            moved[i] -= residual[i]
-            residual[i] += moved[i]
-            x[i] = trial[i]
-        update(inverse, step, moved, trial)
-        size = trial_size
+            trial[i] = x[i] + part * step[i]
     return False
 
 
@@ -355,12 +364,13 @@ class WrenchShooting(NamedTuple):
         first = self.arm.modules[0]
         moment = wrench(first, 0.0, strain[0], known.tensions[: len(first.muscles)])[:3]
         n = len(self.problem.unit)
-        return Guess(moment, known.tensions, strain, np.zeros((n, n)), *known.known)
+        return Guess(moment, known.tensions, strain, np.zeros((n, n)), known.known[0], known.known[1])
 
     def solve(self, state: State, guess: Guess) -> Answer:
         """Solve for the equilibrium at `state`."""
         drive, load, tip = state.drive, state.load, np.eye(4)
-        found = Guess(*(x.copy() for x in guess[:4]), drive, load)
+        moment, tension, strain, inverse = (x.copy() for x in guess[:4])
+        found = Guess(moment, tension, strain, inverse, drive, load)
         converged = solve(self.problem, *found[:4], guess.drive, guess.load, drive, load, self.tolerance, tip)
         return Answer(converged, tip, found if converged else None)
 
