@@ -1,6 +1,6 @@
 """The methods on the speed-accuracy chart, one file each."""
 
 from tca_envs.study.method import Method
-from tca_envs.study.methods import collocation
+from tca_envs.study.methods import collocation, strain_basis
 
-METHODS: tuple[Method, ...] = (collocation.METHOD,)
+METHODS: tuple[Method, ...] = (collocation.METHOD, *strain_basis.METHODS)
