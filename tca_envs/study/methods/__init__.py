@@ -1,6 +1,12 @@
 """The methods on the speed-accuracy chart, one file each."""
 
 from tca_envs.study.method import Method
-from tca_envs.study.methods import collocation, strain_basis
+from tca_envs.study.methods import ablation, bvp, collocation, paper, strain_basis
 
-METHODS: tuple[Method, ...] = (collocation.METHOD, *strain_basis.METHODS)
+METHODS: tuple[Method, ...] = (
+    collocation.METHOD,
+    *strain_basis.METHODS,
+    bvp.METHOD,
+    *paper.METHODS,
+    *ablation.METHODS,
+)

@@ -69,7 +69,7 @@ BEND_AND_TWIST = (0, 1, 2)
 TOLERANCE = 1e-7
 """Newton stops below this: an angle over a module, a strain, a mismatch of length over length."""
 NODES = 4
-"""Gauss nodes of a cell for constant strain, one more for each degree: quadratures then are far more accurate than the basis."""
+"""Gauss nodes of a cell for constant strain, one more for each degree: quadratures are then better than the basis by far."""
 TURNS = 0.5
 """Turns of a helical muscle that a cell spans at most."""
 SLENDERNESS = 40.0
