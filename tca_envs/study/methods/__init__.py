@@ -1,6 +1,13 @@
 """The methods on the speed-accuracy chart, one file each."""
 
 from tca_envs.study.method import Method
-from tca_envs.study.methods import collocation, wrench_shooting
+from tca_envs.study.methods import ablation, bvp, collocation, paper, strain_basis, wrench_shooting
 
-METHODS: tuple[Method, ...] = (collocation.METHOD, wrench_shooting.METHOD)
+METHODS: tuple[Method, ...] = (
+    collocation.METHOD,
+    wrench_shooting.METHOD,
+    *strain_basis.METHODS,
+    bvp.METHOD,
+    *paper.METHODS,
+    *ablation.METHODS,
+)
