@@ -1,7 +1,7 @@
 """The methods on the speed-accuracy chart, one file each."""
 
 from tca_envs.study.method import Method
-from tca_envs.study.methods import ablation, bvp, collocation, paper, strain_basis, wrench_shooting
+from tca_envs.study.methods import ablation, bvp, collocation, elastica, gvs, paper, strain_basis, wrench_shooting
 
 METHODS: tuple[Method, ...] = (
     collocation.METHOD,
@@ -9,5 +9,8 @@ METHODS: tuple[Method, ...] = (
     *strain_basis.METHODS,
     bvp.METHOD,
     *paper.METHODS,
+    elastica.METHOD,
+    elastica.MATCHED,
+    gvs.METHOD,
     *ablation.METHODS,
 )
