@@ -219,8 +219,8 @@ def report(kept: Sequence[Kept]) -> str:
             "States are temperatures drawn uniformly from 25 degC to the heaters' cut-off, reached by a step of up to "
             f"{CHANGE:g} K; in every second state of pick-and-place the gripper holds the object. The truth is an equilibrium "
             "to round-off by multiple shooting (`tca_envs.study.reference`) on the branch that the arm is on; a state without "
-            "equilibrium or reference would count as outside. Times are medians on one machine, taken in turns, of a warm "
-            '`Arm.equilibrium` and of a whole step of the environment; the columns "to 1e-6" compare them with those at 1e-6 m.',
+            "equilibrium or reference would count as outside. Times are medians on one machine, in turns, of a warm "
+            '`Arm.equilibrium` and of a whole step of the environment; columns "to 1e-6" compare with those at 1e-6 m.',
             "![True error and time against the tolerance](tolerance.png)",
             output.markdown_table(header, rows),
             "",
