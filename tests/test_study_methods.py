@@ -149,14 +149,33 @@ def test_constant_curvature_does_not_twist():
 
 
 @pytest.mark.parametrize("method", METHODS[1:], ids=name)
-def test_starts_near_a_known_equilibrium(method):
-    """A method that projects or samples the known equilibrium finds the tip near it, with hardly any work."""
+def test_a_known_equilibrium_is_a_start(method):
     arm = fine(presets.bending_arm)
     known = arm.equilibrium(BENT)
     state = State(arm, BENT)
     solver = method.build(arm, method.settings[2 % len(method.settings)], [state])
     answer = solver.solve(state, solver.near(known, state))
     assert error(answer, known) < (2e-2 if method.reduced else 5e-4)
+
+
+def test_starts_are_near_the_answer():
+    arm = fine(presets.whole_arm)
+    known = arm.equilibrium(WHOLE)
+    state = State(arm, WHOLE)
+    basis = PIECES.build(arm, 16, [state])
+    start, found = basis.near(known, state), basis.solve(state, basis.cold()).guess
+    off, scale = np.abs(start.q - found.q).max(axis=0), np.abs(found.q).max(axis=0)
+    assert (off < 0.1 * scale).all()
+    np.testing.assert_allclose(start.tension, found.tension, atol=1e-3)
+    basis = POLYNOMIALS.build(fine(presets.bending_arm), 4, [])
+    known_bent = fine(presets.bending_arm).equilibrium(BENT)
+    start = basis.near(known_bent, state)
+    found = basis.solve(State(basis.arm, BENT), start).guess
+    np.testing.assert_allclose(start.q, found.q, atol=1e-3 * np.abs(found.q).max())
+    solver = bvp.build(arm, 1e-4, [state])
+    begun, ended = solver.near(known, state), solver.solve(state, solver.cold()).guess
+    np.testing.assert_allclose(begun.y[:, [0, -1]], ended.y[:, [0, -1]], atol=1e-4)
+    np.testing.assert_allclose(begun.tension, ended.tension, atol=1e-5)
 
 
 # Work inside.
