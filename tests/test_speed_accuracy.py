@@ -260,6 +260,7 @@ OURS = [point(1e-4, 1.0), point(1e-6, 2.0), point(1e-5, 3.0), point(1e-8, 4.0)]
 def test_the_front_is_what_nothing_beats():
     assert speed_accuracy.front([*reversed(OURS), NOTHING]) == [OURS[0], OURS[1], OURS[3]]
     assert speed_accuracy.front([point(1.0, 1.0), point(0.5, 1.0)]) == [point(0.5, 1.0)]
+    assert speed_accuracy.front([point(0.5, 2.0), point(0.5, 1.0)]) == [point(0.5, 1.0)]
     assert speed_accuracy.front([]) == []
 
 

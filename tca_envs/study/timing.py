@@ -97,7 +97,7 @@ class Measured(NamedTuple):
     """What a solver did on the first cases of an order."""
 
     time: Array
-    """(k,) [s]."""
+    """(k,) [s]; nan where the state before failed."""
     tip: Array
     """(k, 3) [m]; nan where it failed."""
     error: Array
@@ -194,7 +194,7 @@ def measure(
         position = np.asarray(answer.tip, dtype=np.float64)[:3, 3] if answer.converged else np.full(3, nan)
         error = max(float(np.linalg.norm(position - known.tip)), known.error)
         good = error <= farthest  # not so for nan
-        times.append(seconds if good else nan)
+        times.append(seconds)
         tips.append(position if good else np.full(3, nan))
         errors.append(error if good else nan)
     return Measured(np.array(times), np.array(tips), np.array(errors), spent)
