@@ -79,5 +79,7 @@ class Method:
     that it cannot model."""
     reduced: bool = False
     """Whether it solves a simpler model: then its error does not vanish, and a far answer is no failure."""
+    own_limit: bool = False
+    """Whether it solves another law of its own: then its error is also that against its own finest setting."""
     available: Callable[[], bool] = lambda: True
     """Whether the package that it needs is installed."""

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from tca_envs.mechanics import Arm, Equilibrium
+from tca_envs.mechanics import Arm, Equilibrium, discretise
+from tca_envs.presets import STATES
 from tca_envs.study.method import Answer, Method, State
 
 
@@ -27,8 +28,9 @@ class Collocation(NamedTuple):
 
 
 def build(arm: Arm, tolerance: float, states: Sequence[State]) -> Collocation:
-    """Return the solver for a tip error [m]."""
-    return Collocation(arm)
+    """Return the solver with the cheapest discretisation that keeps the tip within a tolerance [m] over the states."""
+    some = states[:: -(-len(states) // STATES)]
+    return Collocation(discretise(arm, tolerance, [s.drive for s in some], [s.load for s in some]))
 
 
-METHOD = Method("strain collocation (this package)", "tolerance", (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8), build)
+METHOD = Method("strain collocation (this package)", "tolerance", (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9), build)

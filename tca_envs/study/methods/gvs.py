@@ -1,0 +1,328 @@
+"""Geometric variable strain on the speed-accuracy chart: SoRoMoX, strains as Legendre series, in JAX.
+
+Package: `soromox` (https://github.com/tud-phi/soromox), the strain parametrisation of Renda et al., IEEE Robotics and
+Automation Letters 5(3), 2020. Poses, elastic and gravitational energy, threadlike actuators and their path lengths are the
+package's own. It offers no static solver, no muscle law and no rigid body at the tip. So this file adds
+
+* a damped Newton method on coefficients and tensions at once, whose residual and tangent are the first and second derivative
+  of those energies by JAX, compiled into one call, and substeps of drive and load where that fails;
+* the muscles' law in JAX (that of `muscle.elongation`) on the package's path lengths: one equation for each tension;
+* tip force and payload as a potential of the tip's pose.
+
+Its segments take any diagonal stiffness, any mass and any route, so it solves this package's own model. A polynomial in the
+body frame does not follow a helix over several turns: a module with helical muscles is one segment for each turn.
+
+The package's backbone runs along x: its axes (x, y, z) are this package's (z, x, y), in vectors and strains alike.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.util import find_spec
+from math import ceil, pi, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tca_envs.mechanics import Arm, Equilibrium
+from tca_envs.mechanics.collocation import LOAD
+from tca_envs.mechanics.muscle import COIL, SPRING, TENDON
+from tca_envs.study.method import Answer, Array, Method, State
+
+RESIDUAL = 1e-9
+"""Newton stops when its dimensionless residual, of the kind of `Equilibrium.residual`, is below this."""
+MAX_EVALUATIONS = 40
+MAX_HALVINGS = 6
+MAX_BEND = 1.0
+"""A Newton step turns no coefficient's strain by more than this over the segment's length [rad]."""
+MAX_SUBSTEPS = 60
+LIGHT = 1e-9
+"""Mass per length of a weightless module [kg/m]: the package wants a positive one."""
+AXES = np.array([2, 0, 1])
+"""The package's x, y, z in this package's axes."""
+STRAINS = np.concatenate([AXES, AXES + 3])
+
+
+class Point(NamedTuple):
+    """An equilibrium: what a solve starts from."""
+
+    coefficients: Array
+    """Of the strain, as the package orders them: segment, strain, order."""
+    tension: Array
+    """(n,) [N]."""
+    drive: Array
+    load: Array
+
+
+class Carry(NamedTuple):
+    """What the compiled Newton loop keeps: the point, the step from it, the fraction of it to try next."""
+
+    x: Any
+    step: Any
+    factor: Any
+    norm: Any
+    halvings: Any
+    evaluations: Any
+    found: Any
+
+
+class Piece(NamedTuple):
+    """A segment: a part of a module, in arc positions of the arm [m]."""
+
+    module: int
+    start: float
+    length: float
+
+
+@dataclass(frozen=True, eq=False)
+class Strains:
+    """A GVS model of an arm with strains of one order, and its compiled Newton method."""
+
+    arm: Arm
+    order: int
+    pieces: tuple[Piece, ...]
+    newton: Callable[..., Any]
+    """(coefficients, tension, drive, load) -> coefficients, tension, tip pose, whether it converged."""
+
+    def cold(self) -> Point:
+        """Return the unloaded arm."""
+        drive = self.arm.unloaded()[2]
+        size = len(self.pieces) * 6 * (self.order + 1)
+        return Point(np.zeros(size), np.zeros(len(self.arm.muscles)), drive, np.zeros(LOAD))
+
+    @cached_property
+    def projection(self) -> tuple[Array, Array]:
+        """Gauss nodes on [0, 1] (g,), and the matrix (order + 1, g) from values there to Legendre coefficients."""
+        x, w = np.polynomial.legendre.leggauss(self.order + 6)
+        basis = np.polynomial.legendre.legvander(x, self.order).T
+        return (x + 1.0) / 2.0, (2.0 * np.arange(self.order + 1) + 1.0)[:, np.newaxis] * basis * w / 2.0
+
+    def near(self, known: Equilibrium, state: State) -> Point:
+        """Return the least-squares fit to a known equilibrium's strains."""
+        points, matrix = self.projection
+        coefficients = []
+        for piece in self.pieces:
+            strain = known.strain(piece.start + piece.length * points) - self.arm.modules[piece.module].reference_strain
+            coefficients.append((matrix @ strain[:, STRAINS]).T.ravel())
+        return Point(np.concatenate(coefficients), known.tensions, state.drive, state.load)
+
+    def solve(self, state: State, guess: Point) -> Answer:
+        """Solve for the equilibrium at `state`, in substeps from the guess's drive and load where one step fails."""
+        known, to, step = guess, 0.0, 1.0
+        for _ in range(MAX_SUBSTEPS):
+            aim = min(1.0, to + step)
+            # Ends at the asked numbers themselves, not at sums that round.
+            drive = state.drive if aim == 1.0 else guess.drive + aim * (state.drive - guess.drive)
+            load = state.load if aim == 1.0 else guess.load + aim * (state.load - guess.load)
+            coefficients, tension, pose, found = self.newton(known.coefficients, known.tension, drive, load)
+            if found:
+                known, to, step = Point(coefficients, tension, drive, load), aim, 2.0 * step
+                if to == 1.0:
+                    return Answer(True, np.asarray(pose), known)
+            else:
+                step *= 0.25
+        return Answer(False, np.eye(4), None)
+
+
+def build(arm: Arm, order: int, states: Sequence[State]) -> Strains:
+    """Return the model with strains of polynomial order `order`, compiled."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    pieces = _pieces(arm)
+    robot = _robot(arm, order, pieces)
+    solver = Strains(arm, order, pieces, jax.jit(_newton(arm, order, pieces, robot)))
+    for state in states[:1]:
+        solver.solve(state, solver.cold())
+    return solver
+
+
+def _pieces(arm: Arm) -> tuple[Piece, ...]:
+    pieces = []
+    start = 0.0
+    for k, module in enumerate(arm.modules):
+        parts = max(1, ceil(max((abs(muscle.turns) for muscle in module.muscles), default=0.0)))
+        pieces += [Piece(k, start + module.length * i / parts, module.length / parts) for i in range(parts)]
+        start += module.length
+    return tuple(pieces)
+
+
+def _stiffness(arm: Arm, order: int, pieces: Sequence[Piece]) -> list[Array]:
+    """Return the diagonals of the segments' generalised stiffness: Legendre polynomials are orthogonal."""
+    norms = 1.0 / (2.0 * np.arange(order + 1) + 1.0)
+    return [piece.length * np.outer(arm.modules[piece.module].stiffness[STRAINS], norms).ravel() for piece in pieces]
+
+
+def _robot(arm: Arm, order: int, pieces: Sequence[Piece]) -> Any:
+    """Return the package's model of an arm."""
+    import equinox as eqx
+    import jax.numpy as jnp
+    from soromox.actuation import ThreadlikeActuator, ThreadlikeRouting
+    from soromox.actuation.threadlike import BaseThreadlikeRoutingParams, _index_tuple
+    from soromox.systems.components import JointSpec, LinkSpec
+    from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec
+
+    class Helices(BaseThreadlikeRoutingParams):
+        """Routes of all muscles: offset [m], angle [rad] at the module's base and rate [rad/m], base of the module [m]."""
+
+        offset: jnp.ndarray
+        angle: jnp.ndarray
+        rate: jnp.ndarray
+        base: jnp.ndarray
+        start_segment_index: tuple[int, ...] = eqx.field(static=True, converter=_index_tuple)
+        end_segment_index: tuple[int, ...] = eqx.field(static=True, converter=_index_tuple)
+
+        @property
+        def num_paths(self) -> int:
+            return len(self.start_segment_index)
+
+        def validate_structure(self) -> None:
+            pass
+
+        def validate_values(self) -> None:
+            pass
+
+    def offset(path: Any, s: Any) -> Any:
+        a = path.angle + path.rate * (s - path.base)
+        return path.offset * jnp.array([0.0, jnp.cos(a), jnp.sin(a)])
+
+    def derivative(path: Any, s: Any) -> Any:
+        a = path.angle + path.rate * (s - path.base)
+        return path.offset * path.rate * jnp.array([0.0, -jnp.sin(a), jnp.cos(a)])
+
+    basis = StrainBasisSpec("legendre", [1] * 6, order)
+    segments = []
+    for piece, stiffness in zip(pieces, _stiffness(arm, order, pieces), strict=True):
+        module = arm.modules[piece.module]
+        # The section only carries the mass here: stiffness is given.
+        radius = 2.0 * sqrt(module.stiffness[:2].mean() / module.stiffness[5])
+        link = LinkSpec.circular(
+            length=piece.length,
+            radius=radius,
+            density=max(module.mass_per_length, LIGHT) / (pi * radius**2),
+            reference_strain=module.reference_strain[STRAINS].tolist(),
+            stiffness=np.diag(stiffness),
+        )
+        segments.append(GVSSegment(link, JointSpec.fixed(), basis, num_gauss_points=max(5, 2 * order + 2)))
+    routes, spans = [], []
+    base = 0.0
+    for k, module in enumerate(arm.modules):
+        mine = [i for i, piece in enumerate(pieces) if piece.module == k]
+        for muscle in module.muscles:
+            routes.append((muscle.offset, muscle.angle, 2.0 * pi * muscle.turns / module.length, base))
+            spans.append((mine[0], mine[-1]))
+        base += module.length
+    actuators: Any = ()
+    if routes:
+        starts, ends = zip(*spans, strict=True)
+        numbers = [jnp.asarray(column, dtype=jnp.float64) for column in zip(*routes, strict=True)]
+        paths = Helices(*numbers, start_segment_index=starts, end_segment_index=ends)
+        actuators = (ThreadlikeActuator.muscles(ThreadlikeRouting(paths, offset, derivative)),)
+    return GVS.from_segments(
+        segments,
+        gravity=jnp.asarray(arm.gravity[AXES]),
+        base_pose=jnp.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]),
+        actuators=actuators,
+        backend="jax",
+    )
+
+
+def elongation(kind: Array, parameters: Array, rest: Array, tension: Any, drive: Any) -> Any:
+    """Return the elongations (n,) [m] of `muscle.elongation`, in JAX; of a tendon (tension - drive), a law that asks for it.
+
+    Parameters
+    ----------
+    kind, parameters, rest : (n,), (n, PARAMETERS), (n,) arrays
+        As in `collocation.Model`.
+    tension, drive : (n,) JAX arrays
+        [N]; temperature [degC], rest length [m] or tension [N].
+    """
+    import jax.numpy as jnp
+
+    length, gain, compliance, g0, g1, g2, a, b, highest, offset, reference = jnp.asarray(parameters).T
+    x, x0 = drive - offset, reference - offset
+    heated = gain * ((a * x + b) * x - (a * x0 + b) * x0)
+    inside = jnp.clip(tension, 0.0, highest)
+    # Rows of other laws hold other numbers: nothing there may divide by zero, or derivatives become NaN.
+    coil = kind == COIL
+    modulus = jnp.where(coil, g0 + (g1 + g2 * inside) * inside, 1.0)
+    slope = compliance * (g0 - g2 * inside**2) / modulus**2
+    coiled = rest / jnp.where(coil, length, 1.0) * (heated + compliance * inside / modulus + slope * (tension - inside))
+    sprung = drive + tension / jnp.where(kind == SPRING, length, 1.0) - rest
+    return jnp.where(coil, coiled, jnp.where(kind == SPRING, sprung, tension - drive))
+
+
+def _newton(arm: Arm, order: int, pieces: Sequence[Piece], robot: Any) -> Callable[..., Any]:
+    """Return the Newton method as a function for JAX to compile."""
+    import jax
+    import jax.numpy as jnp
+    from jax import lax
+
+    stiffness = np.concatenate(_stiffness(arm, order, pieces))
+    bend = np.repeat([1.0, 0.0], 3 * (order + 1))
+    lengths = np.array([piece.length for piece in pieces])
+    rest, kind, parameters = arm.rest_lengths, arm.model.kind, arm.model.parameters
+    # A coefficient of curvature counts by the angle that it turns its segment, one of stretch as it is.
+    angle = np.where(bend, lengths[:, np.newaxis], 1.0).ravel()
+    unit = np.concatenate([angle / stiffness, 1.0 / rest])
+    turn = (bend * lengths[:, np.newaxis]).ravel()
+    tendon = kind == TENDON
+    size, muscles = stiffness.size, len(rest)
+
+    def energy(q: Any, tension: Any, load: Any) -> tuple[Any, Any]:
+        """Return the potential energy, muscles counted as tension times elongation of the path, and those elongations."""
+        tip = robot.forward_kinematics_tips(q)[-1]
+        weight = load[9] * load[6:9][AXES]
+        hanging = (load[0:3][AXES] + weight) @ tip[:3, 3] + weight @ (tip[:3, :3] @ load[10:13][AXES])
+        path = robot.actuators[0].path_lengths(robot, q) - rest if muscles else rest
+        # The protected energy: the public one brings its own derivative, which carries Jacobians and takes twice the time.
+        return 0.5 * q @ robot.elastic_force(q) + robot._gravitational_energy(q) - hanging + tension @ path, path
+
+    def residual(x: Any, drive: Any, load: Any) -> Any:
+        forces, path = jax.grad(energy, has_aux=True)(x[:size], x[size:], load)
+        # A tendon's own law is its whole equation.
+        gap = jnp.where(tendon, 0.0, path) - elongation(kind, parameters, rest, x[size:], drive)
+        return unit * jnp.concatenate([forces, gap])
+
+    def newton(q: Any, tension: Any, drive: Any, load: Any) -> Any:
+        def tangent_step(x: Any, r: Any) -> tuple[Any, Any]:
+            step = jnp.linalg.solve(jax.jacfwd(residual)(x, drive, load), r)
+            return step, jnp.minimum(1.0, MAX_BEND / jnp.max(turn * jnp.abs(step[:size])))
+
+        # One residual and one tangent in the compiled loop, not one for each place where Newton looks: that compiles faster.
+        def iterate(carry: Carry) -> Carry:
+            trial = carry.x - carry.factor * carry.step
+            r = residual(trial, drive, load)
+            norm = jnp.linalg.norm(r)
+            better = norm < (1.0 - 0.1 * carry.factor) * carry.norm
+            found = better & (jnp.max(jnp.abs(r)) <= RESIDUAL)
+            step, factor = lax.cond(better & ~found, lambda: tangent_step(trial, r), lambda: (carry.step, 0.5 * carry.factor))
+            return Carry(
+                x=jnp.where(better, trial, carry.x),
+                step=step,
+                factor=factor,
+                norm=jnp.where(better, norm, carry.norm),
+                halvings=jnp.where(better, 0, carry.halvings + 1),
+                evaluations=carry.evaluations + 1,
+                found=found,
+            )
+
+        def goes_on(carry: Carry) -> Any:
+            return ~carry.found & (carry.halvings <= MAX_HALVINGS) & (carry.evaluations < MAX_EVALUATIONS)
+
+        start = jnp.concatenate([q, tension])
+        end = lax.while_loop(goes_on, iterate, Carry(start, jnp.zeros_like(start), 0.0, jnp.inf, 0, 0, False))
+        pose = robot.forward_kinematics_tips(end.x[:size])[-1]
+        back = np.argsort(np.append(AXES, 3))
+        return end.x[:size], end.x[size:], pose[back][:, back], end.found
+
+    return newton
+
+
+METHOD = Method(
+    "geometric variable strain (SoRoMoX)",
+    "order",
+    (0, 1, 2, 3, 4, 5),
+    build,
+    available=lambda: find_spec("soromox") is not None,
+)
