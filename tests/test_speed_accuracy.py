@@ -215,10 +215,7 @@ def test_the_error_against_the_finest_setting(bending):
     def build(arm, setting, states):
         return Fake(collocation.Collocation(arm), moved(setting))
 
-    class Limited(Method):
-        own_limit = True
-
-    method = Limited("fake", "shift", (3e-3, 2e-3), build)
+    method = Method("fake", "shift", (3e-3, 2e-3), build, own_limit=True)
     coarse, fine = timing.points(bending, method, Referee(bending), BRIEF, lambda: None)
     assert coarse.error == pytest.approx(3e-3, rel=1e-3)
     assert coarse.own_error == pytest.approx(1e-3, rel=1e-9) and fine.own_error == 0.0

@@ -31,13 +31,13 @@ LABEL_OFFSETS = ((5, 5), (5, -11), (-22, 5), (-22, -11), (9, -3), (-28, -3), (-8
 def styles(names: Sequence[str], ours: str) -> dict[str, dict[str, Any]]:
     """Return how each method is drawn, the same in all figures that are given the same names."""
     others = [name for name in names if name != ours]
-    drawn = {
-        name: {
-            "color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)], "linewidth": 1.3, "markersize": 5.5,
-            "linestyle": "-" if i < len(COLOURS) else "--", "zorder": 4,
-        }
-        for i, name in enumerate(others)
-    }  # fmt: skip
+    drawn = {}
+    for i, name in enumerate(others):
+        again, colour = divmod(i, len(COLOURS))
+        drawn[name] = {
+            "color": COLOURS[colour], "marker": MARKERS[(i + again) % len(MARKERS)], "linestyle": "--" if again else "-",
+            "linewidth": 1.3, "markersize": 5.5, "zorder": 4,
+        }  # fmt: skip
     return {ours: PROJECT, **drawn}
 
 
