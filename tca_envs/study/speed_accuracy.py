@@ -95,8 +95,8 @@ def findings(measured: Sequence[Point], scenes: Sequence[Scene]) -> str:
             verdict(by_scene),
             "## Time of others over that of this package",
             "At equal or better accuracy: the time of a setting, over that of the fastest setting of this package's method "
-            "that is at least as accurate and fails no more often. The range is that over a method's settings; those that are "
-            "more accurate than all of this package's are counted apart.",
+            "that is at least as accurate and fails no more often; below 1 it is faster than any of those. The range is that "
+            "over a method's settings; those that are more accurate than all of this package's are counted apart.",
             output.markdown_table(
                 ["Method", *by_scene], [[name, *(ratios(group, name) for group in by_scene.values())] for name in others]
             ),
