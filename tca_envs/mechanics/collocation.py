@@ -764,7 +764,6 @@ def solve(model, strain, tension, from_drive, from_load, drive, load, ws):
             rung, step, damping = FALL, 1.0, FIRST_DAMPING
 
 
-@entry
 def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report):
     """Solve N arms of one model, each from its own known equilibrium.
 
@@ -785,6 +784,19 @@ def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip,
     report : (N, 3) array
         Out: rung (WARM, SUBSTEPS, FALL or FAILED), dimensionless residual, Newton iterations.
     """
+    _solve_lanes(*model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report)
+
+
+@entry
+def _solve_lanes(
+    elements, nodes, length, a, b, stiffness, reference, first_muscle, route, mass_below, kind, parameters, rest_length,
+    tolerance, ladder, strain, tension, from_drive, from_load, drive, load, tip, lengths, report,
+):  # fmt: skip
+    """`solve_lanes` with the model's fields one by one: of a NamedTuple Numba works out the type at every call, in 3 us."""
+    model = Model(
+        elements, nodes, length, a, b, stiffness, reference, first_muscle, route, mass_below, kind, parameters, rest_length,
+        tolerance, ladder,
+    )  # fmt: skip
     ws = workspace(model)
     for lane in range(strain.shape[0]):
         rung, worst, iterations = solve(

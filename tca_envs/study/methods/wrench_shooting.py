@@ -127,7 +127,7 @@ def shoot(problem, x, drive, load, starts, differentiate, work, residual):
         for i in range(3):
             tangent[i, 3 + i] = 1.0
         columns = 3
-    station = 0
+    station = np.int64(0)  # a literal would have `march` compiled twice
     for k in range(rod.steps.size):
         i0, i1 = rod.first_muscle[k], rod.first_muscle[k + 1]
         state[STATE:] = 0.0
@@ -162,6 +162,14 @@ def shoot(problem, x, drive, load, starts, differentiate, work, residual):
             for i in range(3):
                 matrix[i, j] = (tangent[j, 3 + i] - moment[i]) * unit[j] / unit[i]
     return np.sqrt(total) if total < np.inf else np.inf
+
+
+@inner
+def assign(target, values):
+    """Copy an array into another (compiles much faster than an assignment to a slice)."""
+    flat, source = target.ravel(), values.ravel()
+    for i in range(flat.size):
+        flat[i] = source[i]
 
 
 @inner
@@ -231,7 +239,7 @@ def newton(problem, x, drive, load, starts, inverse, tolerance, work):
         trial_size = shoot(problem, trial, drive, load, starts, not known, work, moved)
         if part == 0.0:
             size = trial_size
-            residual[:] = moved
+            assign(residual, moved)
             if not size < np.inf:
                 return False
         elif trial_size < (1.0 - 0.1 * part) * size:
@@ -258,7 +266,7 @@ def newton(problem, x, drive, load, starts, inverse, tolerance, work):
             return True
         if not known:
             if part != 0.0:
-                trial[:] = x
+                assign(trial, x)
                 part = 0.0
                 continue
             if not invert(work.matrix, inverse):
@@ -325,17 +333,21 @@ def solve(problem, moment, tension, starts, inverse, from_drive, from_load, driv
                 done = 1.0
                 break
             done, substep = here, 2.0 * substep
-            good_x[:], good_starts[:], good_inverse[:] = x, starts, inverse
+            assign(good_x, x)
+            assign(good_starts, starts)
+            assign(good_inverse, inverse)
         else:
             substep *= 0.25 if substep == 1.0 else 0.5
             if substep < SMALLEST_SUBSTEP:
                 break
-            x[:], starts[:], inverse[:] = good_x, good_starts, good_inverse
+            assign(x, good_x)
+            assign(starts, good_starts)
+            assign(inverse, good_inverse)
     if done < 1.0:
         return False
     for i in range(3):
         moment[i] = unit[i] * x[i]
-    tension[:] = work.tension
+    assign(tension, work.tension)
     state = work.state
     r = rotation_matrix((state[0], state[1], state[2], state[3]))
     for i in range(3):
