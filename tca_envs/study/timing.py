@@ -42,7 +42,7 @@ class Effort(NamedTuple):
     """Time [s] that a method has on a scene; then its finer settings are left out."""
 
 
-FULL = Effort(cases=100, budget=2.0, least=3, patience=60.0)
+FULL = Effort(cases=100, budget=2.0, least=3, patience=30.0)
 QUICK = Effort(cases=12, budget=0.1, least=1, patience=0.6)
 
 
