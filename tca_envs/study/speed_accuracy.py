@@ -121,12 +121,12 @@ def protocol(scenes: Sequence[Scene]) -> str:
         f"meet fewer cases.",
         "This package's solver is called as its environments call it, a batch of one, and the other compiled methods likewise, "
         "without checks of arguments; `Arm.equilibrium` checks them and builds a result, which takes some 10 us more.",
-        "The reference is another formulation at near round-off (`tca_envs.study.reference`): the wrench form of the rod as an "
-        "initial value problem, integrated by Runge-Kutta steps of order 8 over short segments (multiple shooting) from base to "
-        "tip; Newton on the mismatches between segments, started on the branch of equilibria that the state before belongs to; "
-        "steps are halved until the tip stays. It shares arm and muscle laws with this package's solver and no numerics. "
-        "Tests hold it against the closed forms (constant tensions, springs, a helical muscle, elastica, Timoshenko) to 1e-11 m "
-        "or to their printed digits, and its own estimate of its error stands with each scene.",
+        "The reference is another formulation at near round-off (`tca_envs.study.reference`): the wrench form of the rod as "
+        "an initial value problem, integrated by Runge-Kutta steps of order 8 over short segments from base to tip (multiple "
+        "shooting); Newton on the mismatches between segments, started on the branch of equilibria that the state before "
+        "belongs to; steps are halved until the tip stays. It shares arm and muscle laws with this package's solver and no "
+        "numerics. Tests hold it against the closed forms (constant tensions, springs, a helical muscle, elastica, Timoshenko) "
+        "to 1e-11 m or to their printed digits; its own estimate of its error stands with each scene.",
         f"Error is the distance of the tip from that of the reference; errors below {SMALLEST_ERROR:g} m count as "
         f"{SMALLEST_ERROR:g} m.",
         f"A solve fails if it says so, returns numbers that are not finite, or ends on another equilibrium: a tip farther than "
