@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from tca_envs.study import output, paper, size, speed_accuracy, tolerance
+from tca_envs.study import ablation, output, paper, size, speed_accuracy, tolerance
 from tca_envs.study.scenes import SCENES
 
 
@@ -52,6 +52,12 @@ STUDIES = {
     "size": Study(
         lambda options: size.run(options.out, options.quick),
         "chart the time of a solve against modules, muscles and lanes",
+        ("matplotlib", "tqdm"),
+        _add_quick,
+    ),
+    "effects": Study(
+        lambda options: ablation.run(options.out, options.quick),
+        "tell which physical effects each scene needs: tip error and time without each of them",
         ("matplotlib", "tqdm"),
         _add_quick,
     ),
