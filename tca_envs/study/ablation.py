@@ -212,7 +212,7 @@ def draw(scenes: Sequence[Scene], rows: Sequence[Row], path: Path) -> None:
     """Draw the tip errors into a PNG file, a panel for each scene."""
     from matplotlib.lines import Line2D
 
-    figure, panels = output.new_figure(len(scenes), 2.9 * len(scenes) + 1.4, 4.3, sharex=True, sharey=True)
+    figure, panels = output.new_figure(len(scenes), 2.9 * len(scenes) + 1.4, 4.5, sharex=True, sharey=True)
     for axes, scene in zip(panels, scenes, strict=True):
         draw_scene(axes, scene, [row for row in rows if row.scene == scene.name])
     panels[0].set_yticks(range(len(NAMES)), NAMES)
@@ -225,6 +225,8 @@ def draw(scenes: Sequence[Scene], rows: Sequence[Row], path: Path) -> None:
         Line2D([], [], **RADIUS_LINE, label="success radius"),
         Line2D([], [], **SHARE_LINE, label=f"{100 * SHARE:.0f} % of the success radius"),
         Line2D([], [], **TOLERANCE_LINE, label="default tolerance"),
+        Line2D([], [], linestyle="none", label=f"yaw: 95 %, if above {100 * SHARE:.0f} % of its limit"),
+        Line2D([], [], linestyle="none", label="time: without it, over with it"),
     ]  # fmt: skip
     figure.legend(handles=entries, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     output.save_figure(figure, path)
