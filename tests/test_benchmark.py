@@ -9,9 +9,12 @@ import time
 
 import numpy as np
 import pytest
+from scipy.stats import spearmanr
 
 from tca_envs import presets
 from tca_envs.mechanics import Arm, Grid, shooting
+from tca_envs.mechanics.collocation import solve_lanes
+from tca_envs.mechanics.discretisation import cost
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
 from tca_envs.tasks.core import CUT_OFF
 
@@ -97,6 +100,27 @@ def test_cold_solve(benchmark, arm):
 def test_tip_jacobian(benchmark, arm):
     start = arm.equilibrium(WARM)
     benchmark(lambda: start.differentiate())
+
+
+def test_the_counted_cost_of_a_grid_follows_the_measured_time():
+    """In order, of a warm solve in compiled code; lanes are many and grids take turns, so that noise hardly matters."""
+    module, lanes = presets.bending_module(), 50
+    grids = [Grid(1, 4), Grid(1, 6), Grid(1, 8), Grid(1, 10), Grid(1, 14), Grid(2, 6), Grid(4, 4), Grid(3, 8)]
+    arms = [Arm([module], presets.GRAVITY, presets.BELOW_BENDING, [grid], 1e-5) for grid in grids]
+    known = [arm.equilibrium(WARM) for arm in arms]
+    asked, tip, report = np.tile(WARM + 1.0, (lanes, 1)), np.tile(np.eye(4), (lanes, 1, 1)), np.empty((lanes, 3))
+    taken = np.empty((40, len(arms)))
+    for row in taken:
+        for j, (arm, start) in enumerate(zip(arms, known, strict=True)):
+            state = (start.nodes[1], start.tensions, *start.known)
+            lane = [np.tile(values, (lanes, *[1] * values.ndim)) for values in state]
+            load, lengths = np.tile(start.load, (lanes, 1)), np.empty((lanes, 3))
+            begun = time.perf_counter()
+            solve_lanes(arm.model, *lane, asked, load, tip, lengths, report)
+            row[j] = (time.perf_counter() - begun) / lanes
+            assert (report[:, 2] == 2).all()
+    measured, counted = taken.min(axis=0), np.array([cost(module, grid) for grid in grids])
+    assert spearmanr(counted, measured).statistic > 0.85
 
 
 @pytest.mark.parametrize(

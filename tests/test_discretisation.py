@@ -105,6 +105,15 @@ def test_the_environment_says_what_was_chosen():
     assert "not estimated" in str(Arm([presets.bending_module()]).discretisation)
 
 
+def test_few_hard_states_among_many_easy_ones_decide():
+    """All TCAs equally hot stretch and shorten the module, which any grid resolves; one state of bending is enough."""
+    arm = Arm([presets.bending_module()], presets.GRAVITY, presets.BELOW_BENDING)
+    easy, hard = np.repeat(np.linspace(30.0, 150.0, 60), 3).reshape(-1, 3), np.array([[144.0, 64.0, 78.0]])
+    chosen = discretise(arm, 1e-4, np.vstack([easy, hard]))
+    assert tip_errors(chosen, hard).max() <= 1e-4
+    assert discretise(arm, 1e-4, easy).grids != chosen.grids
+
+
 def test_states_without_equilibrium_do_not_decide():
     """A rod that is pushed far beyond buckling under a twisting payload may have none in reach; the other states decide."""
     arm = Arm([presets.bending_module()], presets.GRAVITY, presets.BELOW_BENDING)

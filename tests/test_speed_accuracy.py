@@ -100,7 +100,7 @@ class Fake(NamedTuple):
     """(answer, state) -> answer"""
 
     def cold(self):
-        return None
+        return self.inner.cold()
 
     def near(self, known, state):
         return self.inner.near(known, state)
@@ -215,10 +215,7 @@ def test_the_error_against_the_finest_setting(bending):
     def build(arm, setting, states):
         return Fake(collocation.Collocation(arm), moved(setting))
 
-    class Limited(Method):
-        own_limit = True
-
-    method = Limited("fake", "shift", (3e-3, 2e-3), build)
+    method = Method("fake", "shift", (3e-3, 2e-3), build, own_limit=True)
     coarse, fine = timing.points(bending, method, Referee(bending), BRIEF, lambda: None)
     assert coarse.error == pytest.approx(3e-3, rel=1e-3)
     assert coarse.own_error == pytest.approx(1e-3, rel=1e-9) and fine.own_error == 0.0
@@ -260,6 +257,7 @@ OURS = [point(1e-4, 1.0), point(1e-6, 2.0), point(1e-5, 3.0), point(1e-8, 4.0)]
 def test_the_front_is_what_nothing_beats():
     assert speed_accuracy.front([*reversed(OURS), NOTHING]) == [OURS[0], OURS[1], OURS[3]]
     assert speed_accuracy.front([point(1.0, 1.0), point(0.5, 1.0)]) == [point(0.5, 1.0)]
+    assert speed_accuracy.front([point(0.5, 2.0), point(0.5, 1.0)]) == [point(0.5, 1.0)]
     assert speed_accuracy.front([]) == []
 
 

@@ -407,7 +407,7 @@ class Arm:
         if start is None:
             strain, tension, from_drive, from_load = self.unloaded()
         else:
-            strain, tension, from_drive, from_load = self._restart(start)
+            strain, tension, from_drive, from_load = self.restart(start)
         tip, lengths, report = EYE.copy(), np.empty((1, drive.size)), np.empty((1, 3))
         lane = (
             strain[np.newaxis], tension[np.newaxis], from_drive[np.newaxis], from_load[np.newaxis],
@@ -449,7 +449,14 @@ class Arm:
                 )
         return result
 
-    def _restart(self, start: Equilibrium) -> tuple[Array, Array, Array, Array]:
+    def restart(self, start: Equilibrium) -> tuple[Array, Array, Array, Array]:
+        """Return strain (G, 6) on this arm's grid, tension (n,), drive (n,) and load of an equilibrium, as copies.
+
+        Raises
+        ------
+        ValueError
+            For a start with another number of muscles or another length.
+        """
         if not isinstance(start, Equilibrium):
             raise ValueError(f"start = {start!r}: expected an Equilibrium or None")
         if start.tensions.shape != (len(self.muscles),) or abs(start.length - self.length) > 1e-9 * self.length:

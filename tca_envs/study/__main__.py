@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from tca_envs.study import ablation, output, paper, size, speed_accuracy
+from tca_envs.study import ablation, output, paper, size, speed_accuracy, tolerance
 from tca_envs.study.scenes import SCENES
 
 
@@ -42,6 +42,12 @@ STUDIES = {
         "chart time against tip error of ways to solve for equilibrium, on several scenes",
         ("matplotlib", "tqdm"),
         _add_scenes,
+    ),
+    "tolerance": Study(
+        lambda options: tolerance.run(options.out, options.quick),
+        "check that tasks keep the tip error that they are asked for, and what a looser one saves",
+        ("matplotlib", "tqdm"),
+        _add_quick,
     ),
     "size": Study(
         lambda options: size.run(options.out, options.quick),

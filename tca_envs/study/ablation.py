@@ -131,12 +131,10 @@ class Lane:
     """The compiled solve of a view from its state before, as a step of an environment calls it."""
 
     def __init__(self, arm: Arm, view: View) -> None:
-        found = on(arm, view.before)
-        assert found.nodes is not None
         self.arm, self.load = arm, view.now.load
-        self.known = [x[np.newaxis] for x in (found.nodes[1], found.tensions, *found.known)]
+        self.known = [x[np.newaxis] for x in arm.restart(on(arm, view.before))]
         self.drive = view.now.drive[np.newaxis]
-        self.answer = np.eye(4)[np.newaxis].copy(), np.empty((1, found.drive.size)), np.empty((1, 3))
+        self.answer = np.eye(4)[np.newaxis].copy(), np.empty((1, view.now.drive.size)), np.empty((1, 3))
 
     def __call__(self) -> float:
         """Return the time of a solve [s]; nan where it fails."""

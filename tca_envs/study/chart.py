@@ -3,6 +3,7 @@
 import textwrap
 from collections.abc import Sequence
 from itertools import pairwise
+from math import cos, pi, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,20 +25,20 @@ COLOURS = (
 MARKERS = ("s", "^", "D", "v", "p", "<", ">", "h", "d", "8", "*")
 PROJECT: dict[str, Any] = {"color": "black", "marker": "o", "linewidth": 2.4, "markersize": 7.5, "zorder": 6}
 EDGE = {"markeredgecolor": "white", "markeredgewidth": 0.6}
-LABEL_OFFSETS = ((5, 5), (5, -11), (-22, 5), (-22, -11), (9, -3), (-28, -3), (-8, 9), (-8, -16), (5, 14), (5, -20), (-22, 14))
-"""Where a percentage may stand beside its marker [points], the best place first."""
+LABEL_PLACES = [(r, k * pi / 8.0) for r in (13.0, 20.0, 28.0) for k in (2, 14, 6, 10, 0, 8, 4, 12, 1, 15, 7, 9, 3, 13, 5, 11)]
+"""Distance [points] and direction [rad] at which a percentage may stand from its marker, the best place first."""
 
 
 def styles(names: Sequence[str], ours: str) -> dict[str, dict[str, Any]]:
     """Return how each method is drawn, the same in all figures that are given the same names."""
     others = [name for name in names if name != ours]
-    drawn = {
-        name: {
-            "color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)], "linewidth": 1.3, "markersize": 5.5,
-            "linestyle": "-" if i < len(COLOURS) else "--", "zorder": 4,
-        }
-        for i, name in enumerate(others)
-    }  # fmt: skip
+    drawn = {}
+    for i, name in enumerate(others):
+        again, colour = divmod(i, len(COLOURS))
+        drawn[name] = {
+            "color": COLOURS[colour], "marker": MARKERS[(i + again) % len(MARKERS)], "linestyle": "--" if again else "-",
+            "linewidth": 1.3, "markersize": 5.5, "zorder": 4,
+        }  # fmt: skip
     return {ours: PROJECT, **drawn}
 
 
@@ -46,7 +47,7 @@ def draw_scene(scene: Scene, group: Sequence[Point], names: Sequence[str], ours:
     figure, (axes, aside) = output.new_figure(2, 9.6, 5.4, width_ratios=[1.75, 1.0])
     chosen = styles(names, ours)
     draw(axes, group, chosen)
-    axes.set_title(f"{scene.title} ({scene.start})", fontsize=11)
+    axes.set_title(f"{scene.title}, {scene.start} start", fontsize=11)
     aside.set_axis_off()
     legend = aside.legend(
         handles=handles(group, chosen), loc="upper left", frameon=False, fontsize=8.5, borderaxespad=0.0, borderpad=0.0
@@ -176,16 +177,18 @@ def label_failures(
             if not (p.solved and p.failed):
                 continue
             text = f"{100.0 * p.failure_rate:.0f} %"
-            size = np.array([4.6 * len(text), 8.0]) * pixels
+            half = np.array([2.3 * len(text), 4.0]) * pixels
             places = []
-            for offset in LABEL_OFFSETS:
-                low = axes.transData.transform((p.error, p.time)) + np.array(offset) * pixels
-                box = (*low, *(low + size))
+            for distance, angle in LABEL_PLACES:
+                offset = (distance * cos(angle), 0.8 * distance * sin(angle))
+                middle = axes.transData.transform((p.error, p.time)) + np.array(offset) * pixels
+                box = (*(middle - half), *(middle + half))
                 cost = sum(c for l, b, r, t, c in taken if box[0] < r and l < box[2] and box[1] < t and b < box[3])
                 inside = box[0] > bounds.x0 and box[1] > bounds.y0 and box[2] < bounds.x1 and box[3] < bounds.y1
-                places.append((cost + (0 if inside else 100), offset, box))
+                places.append((cost + (0 if inside else 50), offset, box))
             _, offset, box = min(places, key=lambda place: place[0])
-            taken.append((*box, 20))
+            taken.append((*box, 100))
             axes.annotate(
-                text, (p.error, p.time), xytext=offset, textcoords="offset points", fontsize=7, color=chosen[p.method]["color"]
-            )
+                text, (p.error, p.time), xytext=offset, textcoords="offset points", ha="center", va="center", fontsize=7,
+                color=chosen[p.method]["color"],
+            )  # fmt: skip

@@ -140,7 +140,7 @@ def cold(count: int) -> Scene:
     """Return cold starts of the bending arm at random temperatures."""
     arm = presets.bending_arm()
     cases = tuple(Case(None, case.state) for case in heated(arm, count, 1))
-    return Scene("cold", "cold start: bending module, random temperatures", arm, cases)
+    return Scene("cold", "random temperatures: bending module, 3 TCAs", arm, cases)
 
 
 def heavy(count: int) -> Scene:

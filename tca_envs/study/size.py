@@ -97,8 +97,11 @@ class Call:
         self.asked = np.repeat(drive[np.newaxis] + CHANGE, lanes, axis=0)
 
     def _solve(self, drive: Array) -> float:
+        strain, tension, from_drive, from_load = self.state
         begun = time.perf_counter()
-        solve_lanes(self.arm.model, *self.state, drive, self.load, self.tip, self.lengths, self.report)
+        solve_lanes(
+            self.arm.model, strain, tension, from_drive, from_load, drive, self.load, self.tip, self.lengths, self.report
+        )
         taken = time.perf_counter() - begun
         if (self.report[:, 0] == FAILED).any():
             raise RuntimeError(f"no equilibrium of {len(self.arm.modules)} modules at {drive[0].tolist()} degC")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tca_envs.mechanics import Arm, Equilibrium, Grid
 from tca_envs.study.method import Answer, Method, Solver, State
+from tca_envs.study.reference import reference
 from tca_envs.study.scenes import Case, Scene
 
 Array = NDArray[np.float64]
@@ -41,7 +42,7 @@ class Effort(NamedTuple):
     """Time [s] that a method has on a scene; then its finer settings are left out."""
 
 
-FULL = Effort(cases=100, budget=2.0, least=3, patience=60.0)
+FULL = Effort(cases=100, budget=2.0, least=3, patience=30.0)
 QUICK = Effort(cases=12, budget=0.1, least=1, patience=0.6)
 
 
@@ -97,7 +98,7 @@ class Measured(NamedTuple):
     """What a solver did on the first cases of an order."""
 
     time: Array
-    """(k,) [s]."""
+    """(k,) [s]; nan where the state before failed."""
     tip: Array
     """(k, 3) [m]; nan where it failed."""
     error: Array
@@ -116,21 +117,15 @@ class Referee:
         # Sampling an equilibrium takes long, so what methods start from is on a grid no finer than it must be.
         grids = [Grid(grid.elements, max(grid.nodes, 8)) for grid in arm.grids]
         self.near = Arm(arm.modules, arm.gravity, arm.payload, grids, residual_tolerance=1e-9)
-        fine = [Grid(10 * grid.elements, max(grid.nodes, 8)) for grid in arm.grids]
-        self.fine = Arm(arm.modules, arm.gravity, arm.payload, fine, residual_tolerance=1e-11)
 
     def __call__(self, index: int) -> Known:
         """Return the reference of a case."""
         if index not in self.known:
             before, state = self.scene.cases[index]
             start = None if before is None else equilibrium(self.near, before)
-            self.known[index] = Known(start, *self.tip(before, state))
+            found = reference(state, equilibrium(self.near, state, start))
+            self.known[index] = Known(start, found.tip[:3, 3], max(found.error, SMALLEST_ERROR))
         return self.known[index]
-
-    def tip(self, before: State | None, state: State) -> tuple[Array, float]:
-        """Return the tip's position at a state and a bound of its error [m]."""
-        start = None if before is None else equilibrium(self.fine, before)
-        return equilibrium(self.fine, state, start).tip_pose[:3, 3], SMALLEST_ERROR
 
 
 def equilibrium(arm: Arm, state: State, start: Equilibrium | None = None) -> Equilibrium:
@@ -194,7 +189,7 @@ def measure(
         position = np.asarray(answer.tip, dtype=np.float64)[:3, 3] if answer.converged else np.full(3, nan)
         error = max(float(np.linalg.norm(position - known.tip)), known.error)
         good = error <= farthest  # not so for nan
-        times.append(seconds if good else nan)
+        times.append(seconds)
         tips.append(position if good else np.full(3, nan))
         errors.append(error if good else nan)
     return Measured(np.array(times), np.array(tips), np.array(errors), spent)
@@ -280,7 +275,7 @@ def points(scene: Scene, method: Method, referee: Referee, effort: Effort, done:
         result.append(point)
         tips.append(measured.tip)
         done()
-    if getattr(method, "own_limit", False):
+    if method.own_limit:
         result = [p._replace(own_error=distance(tip, tips[-1])) for p, tip in zip(result, tips, strict=True)]
     return result
 

@@ -518,6 +518,8 @@ def _quaternion(rotation: Array, last: Array) -> Array:
 
 def build(arm: Arm, tolerance: float, states: Sequence[State]) -> Bvp:
     """Return the solver at a tolerance."""
+    if not arm.muscles:
+        raise ValueError("expected an arm with muscles: their tensions are the parameters of the boundary value problem")
     modules, whole = arm.modules, arm.model
     mass = np.array([module.mass_per_length * module.length for module in modules])
     muscles = [muscle for module in modules for muscle in module.muscles]

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from math import sqrt
+from math import cos, pi, sin, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tca_envs.mechanics import Arm, Equilibrium
-from tca_envs.mechanics.algebra import cross, dot, entry, inner
+from tca_envs.mechanics.algebra import axpy, cross, dot, entry, inner
 from tca_envs.mechanics.muscle import TENDON, elongation
 from tca_envs.study.method import Answer, Array, Method, State
 
@@ -48,9 +48,9 @@ class Routes(NamedTuple):
     """Muscles, in elements of the rod; element 0 is the clamped one. n muscles, at most q elements to a muscle."""
 
     first: NDArray[np.int64]  # (n,) first element
-    count: NDArray[np.int64]  # (n,) number of elements
-    element: Array  # (n, q, 4) x, y [m] and their derivatives at the elements' middles
-    boundary: Array  # (n, q + 1, 4) the same between elements; the first and last: in the middle of half an element
+    span: NDArray[np.int64]  # (n,) number of elements
+    place: Array  # (n, q + 1, 4) x, y [m] and their derivatives between elements; at the ends: within half an element
+    turn: Array  # (n, 4) cosine and sine of the muscle's turn over half an element, over a quarter
     share: Array  # (n, 2, 3) share of a muscle's couples in those across its first and last boundary, about x, y, z
     kind: NDArray[np.int64]  # (n,) as in `collocation.Model`
     parameters: Array
@@ -76,27 +76,64 @@ def to_body(directors, e, x):
 
 
 @inner
-def bend_at(kappa, a, b, x):
-    """Return u at x in a muscle's span a <= x <= b (x = a where element a begins), from that span's own boundaries alone."""
-    # Boundary v lies at x = v + 1; boundaries a to b - 2 are inside. Outside them the line goes on.
-    v = min(max(int(x) - 1, a), b - 3)
-    w = x - (v + 1)
+def tangent(routes, i, k, lengths, sigma, kappa, end):
+    """Return p_i' = v + u x r + r' at place k of muscle i, and the length of rod that it stands for; `end` is u at the tip.
+
+    Along a helical muscle v turns as the muscle does: a mean of elements is one in the frame that turns along.
+    Extrapolating u, instead of taking the nearest, would feed energy into the rod: it flutters.
+    """
+    a, count = routes.first[i], routes.span[i]
+    b = a + count
+    if k == 0:
+        v, width = turned(sigma, a, routes.turn[i, 2], -routes.turn[i, 3]), 0.5 * lengths[a]
+        u = kappa[0, a], kappa[1, a], kappa[2, a]
+        if a == 1:
+            # All of the bend across the clamped element's end is in the half element beyond.
+            grow = (lengths[0] + lengths[1]) / lengths[1]
+            u = grow * kappa[0, 0], grow * kappa[1, 0], grow * kappa[2, 0]
+    elif k == count:
+        v, width = turned(sigma, b - 1, routes.turn[i, 2], routes.turn[i, 3]), 0.5 * lengths[b - 1]
+        u = kappa[0, b - 2], kappa[1, b - 2], kappa[2, b - 2]
+        if b == lengths.size:
+            u = end
+    else:
+        e = a + k - 1
+        below = turned(sigma, e, routes.turn[i, 0], routes.turn[i, 1])
+        beyond = turned(sigma, e + 1, routes.turn[i, 0], -routes.turn[i, 1])
+        v, width = (0.5 * (below[0] + beyond[0]), 0.5 * (below[1] + beyond[1]), 0.5 * (below[2] + beyond[2])), lengths[e]
+        u = kappa[0, e], kappa[1, e], kappa[2, e]
+    x, y = routes.place[i, k, 0], routes.place[i, k, 1]
     return (
-        (1.0 - w) * kappa[0, v] + w * kappa[0, v + 1],
-        (1.0 - w) * kappa[1, v] + w * kappa[1, v + 1],
-        (1.0 - w) * kappa[2, v] + w * kappa[2, v + 1],
-    )
+        v[0] - u[2] * y + routes.place[i, k, 2],
+        v[1] + u[2] * x + routes.place[i, k, 3],
+        v[2] + 1.0 + u[0] * y - u[1] * x,
+    ), width
 
 
 @inner
-def tangent(route, i, k, u, sigma, e, f):
-    """Return p_i' = v + u x r + r' at place k of muscle i, v being the mean of those of elements e and f."""
-    x, y = route[i, k, 0], route[i, k, 1]
-    return (
-        0.5 * (sigma[0, e] + sigma[0, f]) - u[2] * y + route[i, k, 2],
-        0.5 * (sigma[1, e] + sigma[1, f]) + u[2] * x + route[i, k, 3],
-        0.5 * (sigma[2, e] + sigma[2, f]) + 1.0 + u[0] * y - u[1] * x,
-    )
+def turned(x, e, c, s):
+    """Return column e of x (3, ...), turned about z by the angle of cosine c and sine s."""
+    return c * x[0, e] - s * x[1, e], s * x[0, e] + c * x[1, e], x[2, e]
+
+
+@inner
+def pull_on(e, force, c, s, lengths, sigma, directors, forces, torques):
+    """Add the muscle's force on the cross sections of element e, turned about z by the angle of cosine c and sine s."""
+    t = c * force[0] - s * force[1], s * force[0] + c * force[1], force[2]
+    torque = cross((sigma[0, e], sigma[1, e], sigma[2, e] + 1.0), t)
+    for d in range(3):
+        torques[d, e] += lengths[e] * torque[d]
+        part = directors[0, d, e] * t[0] + directors[1, d, e] * t[1] + directors[2, d, e] * t[2]
+        forces[d, e] += part
+        forces[d, e + 1] -= part
+
+
+@inner
+def bent(u, s, x):
+    """Return the vector x of the frame at s beyond, in the frame here: u is constant, and the turn up to second order."""
+    once = cross(u, x)
+    twice = cross(u, once)
+    return axpy(s, once, axpy(0.5 * s * s, twice, x))
 
 
 @inner
@@ -121,7 +158,7 @@ def share_of(share, i, end, couple):
 
 @entry
 def apply(
-    routes, lengths, widths, weights, drive, load, tension, sigma, kappa, directors, forces, torques
+    routes, lengths, widths, weights, tip, drive, load, tension, sigma, kappa, directors, forces, torques
 ):  # fmt: skip
     """Add weight, tip load, payload and muscles to the external forces and torques of the rod; update the tensions.
 
@@ -131,6 +168,8 @@ def apply(
         The muscles.
     lengths, widths, weights : (e,), (e - 1,), (e + 1,) arrays
         Rest lengths of elements and of the spans between their middles [m], masses that weigh on the nodes [kg].
+    tip : (10,) array
+        B, u* and the power of e in the law at the tip, and u there, which this computes.
     drive, load, tension : (n,), (LOAD,), (n,) arrays
         As of `State`; tensions [N] are those of the last step.
     sigma, kappa, directors : (3, e), (3, e - 1), (3, 3, e) arrays
@@ -143,64 +182,72 @@ def apply(
     for node in range(2, elements + 1):
         for d in range(3):
             forces[d, node] += weights[node] * load[6 + d]
-    # The tip's frame lies half an element beyond the last director.
-    u = bend_at(kappa, 1, elements, elements - 0.25)
-    half = 0.5 * lengths[last]
-    turn = half * u[0], half * u[1], half * u[2]
-    arm = load[10], load[11], load[12]
-    once = cross(turn, arm)
-    twice = cross(turn, once)
-    centre = arm[0] + once[0] + 0.5 * twice[0], arm[1] + once[1] + 0.5 * twice[1], arm[2] + once[2] + 0.5 * twice[2]
     weight = load[9] * load[6], load[9] * load[7], load[9] * load[8]
     for d in range(3):
         forces[d, elements] += load[d] + weight[d]
-    moment = cross(centre, to_body(directors, last, weight))
-    tip_moment = to_body(directors, last, (load[3], load[4], load[5]))
+    # The tip's frame lies half an element beyond the last director, bent as its own moment bends it.
+    arm = load[10], load[11], load[12]
+    hangs = to_body(directors, last, weight)
+    twists = to_body(directors, last, (load[3], load[4], load[5]))
+    end = kappa[0, last - 1], kappa[1, last - 1], kappa[2, last - 1]
+    moment = axpy(1.0, twists, cross(bent(end, 0.5 * lengths[last], arm), hangs))
+    for i in range(routes.first.size):
+        count = routes.span[i]
+        if routes.first[i] + count == elements:
+            t, _ = tangent(routes, i, count, lengths, sigma, kappa, end)
+            x, y = routes.place[i, count, 0], routes.place[i, count, 1]
+            scale = -tension[i] / sqrt(dot(t, t))
+            moment = axpy(scale, (y * t[2], -x * t[2], x * t[1] - y * t[0]), moment)
+    v = sigma[0, last], sigma[1, last], sigma[2, last] + 1.0
+    softer = dot(v, v) ** (0.5 * tip[6])
+    end = (
+        tip[3] + softer * moment[0] / tip[0],
+        tip[4] + softer * moment[1] / tip[1],
+        tip[5] + softer * moment[2] / tip[2],
+    )
     for d in range(3):
-        torques[d, last] += moment[d] + tip_moment[d]
+        tip[7 + d] = end[d]
+    moment = axpy(1.0, twists, cross(bent(end, 0.5 * lengths[last], arm), hangs))
+    for d in range(3):
+        torques[d, last] += moment[d]
 
     for i in range(routes.first.size):
-        a, count = routes.first[i], routes.count[i]
+        a, count = routes.first[i], routes.span[i]
         b = a + count
         length = 0.0
-        for e in range(a, b):
-            u = bend_at(kappa, a, b, e + 0.5)
-            t = tangent(routes.element, i, e - a, u, sigma, e, e)
-            length += lengths[e] * sqrt(dot(t, t))
+        for k in range(count + 1):
+            t, width = tangent(routes, i, k, lengths, sigma, kappa, end)
+            length += width * sqrt(dot(t, t))
         pull = pull_at(routes, i, length, tension[i], drive[i])
         tension[i] = pull
-        for e in range(a, b):
-            t = tangent(routes.element, i, e - a, bend_at(kappa, a, b, e + 0.5), sigma, e, e)
+        for k in range(count + 1):
+            t, _ = tangent(routes, i, k, lengths, sigma, kappa, end)
             scale = pull / sqrt(dot(t, t))
             t = scale * t[0], scale * t[1], scale * t[2]
-            torque = cross((sigma[0, e], sigma[1, e], sigma[2, e] + 1.0), t)
-            for d in range(3):
-                torques[d, e] += lengths[e] * torque[d]
-                force = directors[0, d, e] * t[0] + directors[1, d, e] * t[1] + directors[2, d, e] * t[2]
-                forces[d, e] += force
-                forces[d, e + 1] -= force
-        # Couples live between elements; a muscle has its share of those at its ends. Nothing is beyond the tip.
-        for k in range(count + 1):
-            v = a - 1 + k
-            if v == last:
-                continue
+            # A force belongs to the elements that its place has v from: to each by half, for every element has two places.
+            half = 0.5 * t[0], 0.5 * t[1], 0.5 * t[2]
             if k == 0:
-                t = tangent(routes.boundary, i, k, bend_at(kappa, a, b, a + 0.25), sigma, a, a)
+                pull_on(a, half, routes.turn[i, 2], routes.turn[i, 3], lengths, sigma, directors, forces, torques)
             elif k == count:
-                t = tangent(routes.boundary, i, k, bend_at(kappa, a, b, b - 0.25), sigma, b - 1, b - 1)
+                pull_on(b - 1, half, routes.turn[i, 2], -routes.turn[i, 3], lengths, sigma, directors, forces, torques)
             else:
-                t = tangent(routes.boundary, i, k, (kappa[0, v], kappa[1, v], kappa[2, v]), sigma, v, v + 1)
-            scale = pull / sqrt(dot(t, t))
-            x, y = routes.boundary[i, k, 0], routes.boundary[i, k, 1]
-            couple = scale * y * t[2], -scale * x * t[2], scale * (x * t[1] - y * t[0])
+                e = a + k - 1
+                pull_on(e, half, routes.turn[i, 0], -routes.turn[i, 1], lengths, sigma, directors, forces, torques)
+                pull_on(e + 1, half, routes.turn[i, 0], routes.turn[i, 1], lengths, sigma, directors, forces, torques)
+            # A couple belongs to a boundary of elements; a muscle's end has its share. Nothing is beyond the tip.
+            boundary = a - 1 + k
+            if boundary == last:
+                continue
+            x, y = routes.place[i, k, 0], routes.place[i, k, 1]
+            couple = y * t[2], -x * t[2], x * t[1] - y * t[0]
             if k == 0:
                 couple = share_of(routes.share, i, 0, couple)
             elif k == count:
                 couple = share_of(routes.share, i, 1, couple)
-            turn = cross((kappa[0, v], kappa[1, v], kappa[2, v]), couple)
+            turn = cross((kappa[0, boundary], kappa[1, boundary], kappa[2, boundary]), couple)
             for d in range(3):
-                torques[d, v] += couple[d] + 0.5 * widths[v] * turn[d]
-                torques[d, v + 1] += -couple[d] + 0.5 * widths[v] * turn[d]
+                torques[d, boundary] += couple[d] + 0.5 * widths[boundary] * turn[d]
+                torques[d, boundary + 1] += -couple[d] + 0.5 * widths[boundary] * turn[d]
 
 
 @entry
@@ -246,7 +293,11 @@ class Relaxation:
     step: Any
     """() -> None: one time step."""
     inputs: Inputs
-    routes: Routes
+    stiffness: tuple[Array, Array]
+    """S and B of the unloaded rod."""
+    matched: bool
+    tip: Array
+    """As of `apply`."""
     time_step: float
     way: float
     """At rest when no node has farther to go [m]."""
@@ -293,6 +344,9 @@ class Relaxation:
         before: tuple[Array, Array] | None = None
         for _ in range(MAX_STEPS // BLOCK):
             inputs.factor = np.exp(-2.0 * slowest * self.time_step)
+            if self.matched:
+                # Not at every step: stiffness that lags behind a fast motion by one step drives it.
+                match(rod.dilatation, rod.voronoi_dilatation, *self.stiffness, rod.shear_matrix, rod.bend_matrix)
             for _ in range(BLOCK):
                 self.step()
             # The clamped nodes feel forces but do not move.
@@ -314,9 +368,9 @@ class Relaxation:
     def _tip(self) -> Array:
         """Return the pose of the tip: the last element's, turned on over its second half."""
         rod = self.rod
-        u = 1.75 * rod.kappa[:, -1] - 0.75 * rod.kappa[:, -2]
+        turn = Rotation.from_rotvec(0.5 * rod.rest_lengths[-1] * self.tip[7:])
         pose = np.eye(4)
-        pose[:3, :3] = rod.director_collection[:, :, -1].T @ Rotation.from_rotvec(0.5 * rod.rest_lengths[-1] * u).as_matrix()
+        pose[:3, :3] = rod.director_collection[:, :, -1].T @ turn.as_matrix()
         pose[:3, 3] = rod.position_collection[:, -1]
         return pose
 
@@ -335,18 +389,16 @@ def build(arm: Arm, elements: int, states: Sequence[State], matched: bool) -> Re
         weights[mine + 1] += 0.5 * mass
     tension, drive, load = np.zeros(len(arm.muscles)), arm.unloaded()[2], arm.unloaded()[3]
     inputs = Inputs(drive, load, tension)
-    lengths, shear, bend = rod.rest_lengths.copy(), rod.shear_matrix.copy(), rod.bend_matrix.copy()
+    lengths, stiffness = rod.rest_lengths.copy(), (rod.shear_matrix.copy(), rod.bend_matrix.copy())
     time_step = _time_step(rod)
+    tip = np.concatenate([stiffness[1][range(3), range(3), -1], rod.rest_kappa[:, -1], [0.0 if matched else 3.0], np.zeros(3)])
 
     class Load(elastica.NoForces):
         def apply_forces(self, system: Any, time: float = 0.0) -> None:
             apply(
-                routes, lengths, widths, weights, drive, load, tension, system.sigma, system.kappa,
+                routes, lengths, widths, weights, tip, drive, load, tension, system.sigma, system.kappa,
                 system.director_collection, system.external_forces, system.external_torques,
             )  # fmt: skip
-            if matched:
-                # For the next step: at rest the stretch no longer changes.
-                match(system.dilatation, system.voronoi_dilatation, shear, bend, system.shear_matrix, system.bend_matrix)
 
     class Damper(elastica.DamperBase):
         def dampen_rates(self, system: Any, time: float) -> None:
@@ -363,7 +415,7 @@ def build(arm: Arm, elements: int, states: Sequence[State], matched: bool) -> Re
     unloaded = Rest(rod.position_collection.copy(), rod.director_collection.copy(), tension.copy())
     step = partial(elastica.PositionVerlet().step, simulator, 0.0, time_step)
     way = REST * (arm.length / elements) ** 2 / arm.length
-    solver = Relaxation(arm, rod, step, inputs, routes, time_step, way, unloaded, arcs)
+    solver = Relaxation(arm, rod, step, inputs, stiffness, matched, tip, time_step, way, unloaded, arcs)
     step()
     return solver
 
@@ -421,31 +473,32 @@ def _time_step(rod: Any) -> float:
 
 def _routes(arm: Arm, elements: int, rod: Any, widths: Array) -> Routes:
     """Return the muscles' places in the rod."""
-    middles, boundaries = (np.arange(elements) + 0.5) / elements, np.arange(elements + 1.0) / elements
-    boundaries[0], boundaries[-1] = 0.25 / elements, 1.0 - 0.25 / elements
-    first, at_middles, at_boundaries, shares = [], [], [], []
+    places = np.arange(elements + 1.0) / elements
+    places[0], places[-1] = 0.25 / elements, 1.0 - 0.25 / elements
+    first, place, turn, shares = [], [], [], []
     for k, module in enumerate(arm.modules):
         start = 1 + k * elements
-        half = 0.5 * module.length / elements / module.stiffness[:3]
+        compliance = 0.5 * module.length / elements / module.stiffness[:3]
         spans = [
             (v, widths[v] / rod.bend_matrix[range(3), range(3), v])
             for v in (start - 1, start + elements - 1)
             if v < widths.size
         ]
         share = np.ones((2, 3))
-        for place, (_, whole) in enumerate(spans):
-            share[place] = half / whole
+        for end, (_, whole) in enumerate(spans):
+            share[end] = compliance / whole
         for muscle in module.muscles:
             first.append(start)
-            at_middles.append([module.route(muscle, x) for x in middles])
-            at_boundaries.append([module.route(muscle, x) for x in boundaries])
+            place.append([module.route(muscle, x) for x in places])
+            half = pi * muscle.turns / elements
+            turn.append([cos(half), sin(half), cos(0.5 * half), sin(0.5 * half)])
             shares.append(share)
     n = len(first)
     return Routes(
         first=np.array(first, dtype=np.int64),
-        count=np.full(n, elements, dtype=np.int64),
-        element=np.array(at_middles).reshape(n, elements, 4),
-        boundary=np.array(at_boundaries).reshape(n, elements + 1, 4),
+        span=np.full(n, elements, dtype=np.int64),
+        place=np.array(place).reshape(n, elements + 1, 4),
+        turn=np.array(turn).reshape(n, 4),
         share=np.array(shares).reshape(n, 2, 3),
         kind=arm.model.kind,
         parameters=arm.model.parameters,

@@ -17,7 +17,7 @@ The package's backbone runs along x: its axes (x, y, z) are this package's (z, x
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property, partial
 from importlib.util import find_spec
 from math import ceil, pi, sqrt
 from typing import Any, NamedTuple
@@ -127,11 +127,18 @@ class Strains:
 def build(arm: Arm, order: int, states: Sequence[State]) -> Strains:
     """Return the model with strains of polynomial order `order`, compiled."""
     import jax
+    import jax.numpy as jnp
 
     jax.config.update("jax_enable_x64", True)
     pieces = _pieces(arm)
-    robot = _robot(arm, order, pieces)
-    solver = Strains(arm, order, pieces, jax.jit(_newton(arm, order, pieces, robot)))
+    bends = np.repeat([1.0, 0.0], 3 * (order + 1))
+    lengths = np.array([piece.length for piece in pieces])[:, np.newaxis]
+    # A coefficient of curvature counts by the angle that it turns its segment, one of stretch as it is.
+    angle = np.where(bends, lengths, 1.0).ravel()
+    unit = np.concatenate([angle / np.concatenate(_stiffness(arm, order, pieces)), 1.0 / arm.rest_lengths])
+    numbers = Numbers(unit, (bends * lengths).ravel(), arm.rest_lengths, arm.model.kind, arm.model.parameters)
+    newton = partial(_package().newton, _robot(arm, order, pieces), jax.tree.map(jnp.asarray, numbers))
+    solver = Strains(arm, order, pieces, newton)
     for state in states[:1]:
         solver.solve(state, solver.cold())
     return solver
@@ -153,14 +160,35 @@ def _stiffness(arm: Arm, order: int, pieces: Sequence[Piece]) -> list[Array]:
     return [piece.length * np.outer(arm.modules[piece.module].stiffness[STRAINS], norms).ravel() for piece in pieces]
 
 
-def _robot(arm: Arm, order: int, pieces: Sequence[Piece]) -> Any:
-    """Return the package's model of an arm."""
+class Numbers(NamedTuple):
+    """An arm's numbers that the Newton method reads beside the package's model; arrays, in the package's axes."""
+
+    unit: Any
+    """What makes residuals dimensionless: of forces (coefficients,), then of lengths (n,)."""
+    turn: Any
+    """Angle by which a coefficient turns its segment (coefficients,) [rad m]; 0 for stretch."""
+    rest: Any
+    kind: Any
+    parameters: Any
+
+
+class Package(NamedTuple):
+    """What needs the package to be defined: made once, so that arms of one structure share what is compiled."""
+
+    paths: Callable[..., Any]
+    """(offset, angle, rate, base, first segment, last segment), all (n,) -> the package's routes of muscles."""
+    newton: Callable[..., Any]
+    """(model, numbers, coefficients, tension, drive, load) -> coefficients, tension, tip pose, whether it converged."""
+
+
+@cache
+def _package() -> Package:
     import equinox as eqx
+    import jax
     import jax.numpy as jnp
-    from soromox.actuation import ThreadlikeActuator, ThreadlikeRouting
-    from soromox.actuation.threadlike import BaseThreadlikeRoutingParams, _index_tuple
-    from soromox.systems.components import JointSpec, LinkSpec
-    from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec
+    from jax import lax
+    from soromox.actuation import ThreadlikeRouting
+    from soromox.actuation.threadlike import BaseThreadlikeRoutingParams
 
     class Helices(BaseThreadlikeRoutingParams):
         """Routes of all muscles: offset [m], angle [rad] at the module's base and rate [rad/m], base of the module [m]."""
@@ -169,8 +197,8 @@ def _robot(arm: Arm, order: int, pieces: Sequence[Piece]) -> Any:
         angle: jnp.ndarray
         rate: jnp.ndarray
         base: jnp.ndarray
-        start_segment_index: tuple[int, ...] = eqx.field(static=True, converter=_index_tuple)
-        end_segment_index: tuple[int, ...] = eqx.field(static=True, converter=_index_tuple)
+        start_segment_index: tuple[int, ...] = eqx.field(static=True)
+        end_segment_index: tuple[int, ...] = eqx.field(static=True)
 
         @property
         def num_paths(self) -> int:
@@ -189,6 +217,71 @@ def _robot(arm: Arm, order: int, pieces: Sequence[Piece]) -> Any:
     def derivative(path: Any, s: Any) -> Any:
         a = path.angle + path.rate * (s - path.base)
         return path.offset * path.rate * jnp.array([0.0, -jnp.sin(a), jnp.cos(a)])
+
+    def paths(*numbers: Any) -> Any:
+        arrays = [jnp.asarray(column, dtype=jnp.float64) for column in numbers[:4]]
+        return ThreadlikeRouting(Helices(*arrays, *numbers[4:]), offset, derivative)
+
+    def energy(q: Any, tension: Any, load: Any, robot: Any, rest: Any) -> tuple[Any, Any]:
+        """Return the potential energy, muscles counted as tension times elongation of the path, and those elongations."""
+        tip = robot.forward_kinematics_tips(q)[-1]
+        weight = load[9] * load[6:9][AXES]
+        hanging = (load[0:3][AXES] + weight) @ tip[:3, 3] + weight @ (tip[:3, :3] @ load[10:13][AXES])
+        path = robot.actuators[0].path_lengths(robot, q) - rest if rest.size else rest
+        # The protected energy: the public one brings its own derivative, which carries Jacobians and takes twice the time.
+        return 0.5 * q @ robot.elastic_force(q) + robot._gravitational_energy(q) - hanging + tension @ path, path
+
+    def residual(x: Any, drive: Any, load: Any, robot: Any, numbers: Numbers) -> Any:
+        size = numbers.turn.size
+        tension = x[size:]
+        forces, path = jax.grad(energy, has_aux=True)(x[:size], tension, load, robot, numbers.rest)
+        # A tendon's own law is its whole equation.
+        gap = jnp.where(numbers.kind == TENDON, 0.0, path)
+        gap = gap - elongation(numbers.kind, numbers.parameters, numbers.rest, tension, drive)
+        return numbers.unit * jnp.concatenate([forces, gap])
+
+    @eqx.filter_jit
+    def newton(robot: Any, numbers: Numbers, q: Any, tension: Any, drive: Any, load: Any) -> Any:
+        def tangent_step(x: Any, r: Any) -> tuple[Any, Any]:
+            step = jnp.linalg.solve(jax.jacfwd(residual)(x, drive, load, robot, numbers), r)
+            return step, jnp.minimum(1.0, MAX_BEND / jnp.max(numbers.turn * jnp.abs(step[: q.size])))
+
+        # One residual and one tangent in the compiled loop, not one for each place where Newton looks: that compiles faster.
+        def iterate(carry: Carry) -> Carry:
+            trial = carry.x - carry.factor * carry.step
+            r = residual(trial, drive, load, robot, numbers)
+            norm = jnp.linalg.norm(r)
+            better = norm < (1.0 - 0.1 * carry.factor) * carry.norm
+            found = better & (jnp.max(jnp.abs(r)) <= RESIDUAL)
+            step, factor = lax.cond(better & ~found, lambda: tangent_step(trial, r), lambda: (carry.step, 0.5 * carry.factor))
+            return Carry(
+                x=jnp.where(better, trial, carry.x),
+                step=step,
+                factor=factor,
+                norm=jnp.where(better, norm, carry.norm),
+                halvings=jnp.where(better, 0, carry.halvings + 1),
+                evaluations=carry.evaluations + 1,
+                found=found,
+            )
+
+        def goes_on(carry: Carry) -> Any:
+            return ~carry.found & (carry.halvings <= MAX_HALVINGS) & (carry.evaluations < MAX_EVALUATIONS)
+
+        start = jnp.concatenate([q, tension])
+        end = lax.while_loop(goes_on, iterate, Carry(start, jnp.zeros_like(start), 0.0, jnp.inf, 0, 0, False))
+        pose = robot.forward_kinematics_tips(end.x[: q.size])[-1]
+        back = np.argsort(np.append(AXES, 3))
+        return end.x[: q.size], end.x[q.size :], pose[back][:, back], end.found
+
+    return Package(paths, newton)
+
+
+def _robot(arm: Arm, order: int, pieces: Sequence[Piece]) -> Any:
+    """Return the package's model of an arm."""
+    import jax.numpy as jnp
+    from soromox.actuation import ThreadlikeActuator
+    from soromox.systems.components import JointSpec, LinkSpec
+    from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec
 
     basis = StrainBasisSpec("legendre", [1] * 6, order)
     segments = []
@@ -214,10 +307,8 @@ def _robot(arm: Arm, order: int, pieces: Sequence[Piece]) -> Any:
         base += module.length
     actuators: Any = ()
     if routes:
-        starts, ends = zip(*spans, strict=True)
-        numbers = [jnp.asarray(column, dtype=jnp.float64) for column in zip(*routes, strict=True)]
-        paths = Helices(*numbers, start_segment_index=starts, end_segment_index=ends)
-        actuators = (ThreadlikeActuator.muscles(ThreadlikeRouting(paths, offset, derivative)),)
+        paths = _package().paths(*zip(*routes, strict=True), *zip(*spans, strict=True))
+        actuators = (ThreadlikeActuator.muscles(paths),)
     return GVS.from_segments(
         segments,
         gravity=jnp.asarray(arm.gravity[AXES]),
@@ -227,19 +318,19 @@ def _robot(arm: Arm, order: int, pieces: Sequence[Piece]) -> Any:
     )
 
 
-def elongation(kind: Array, parameters: Array, rest: Array, tension: Any, drive: Any) -> Any:
+def elongation(kind: Any, parameters: Any, rest: Any, tension: Any, drive: Any) -> Any:
     """Return the elongations (n,) [m] of `muscle.elongation`, in JAX; of a tendon (tension - drive), a law that asks for it.
 
     Parameters
     ----------
-    kind, parameters, rest : (n,), (n, PARAMETERS), (n,) arrays
+    kind, parameters, rest : (n,), (n, PARAMETERS), (n,) JAX arrays
         As in `collocation.Model`.
     tension, drive : (n,) JAX arrays
         [N]; temperature [degC], rest length [m] or tension [N].
     """
     import jax.numpy as jnp
 
-    length, gain, compliance, g0, g1, g2, a, b, highest, offset, reference = jnp.asarray(parameters).T
+    length, gain, compliance, g0, g1, g2, a, b, highest, offset, reference = parameters.T
     x, x0 = drive - offset, reference - offset
     heated = gain * ((a * x + b) * x - (a * x0 + b) * x0)
     inside = jnp.clip(tension, 0.0, highest)
@@ -250,73 +341,6 @@ def elongation(kind: Array, parameters: Array, rest: Array, tension: Any, drive:
     coiled = rest / jnp.where(coil, length, 1.0) * (heated + compliance * inside / modulus + slope * (tension - inside))
     sprung = drive + tension / jnp.where(kind == SPRING, length, 1.0) - rest
     return jnp.where(coil, coiled, jnp.where(kind == SPRING, sprung, tension - drive))
-
-
-def _newton(arm: Arm, order: int, pieces: Sequence[Piece], robot: Any) -> Callable[..., Any]:
-    """Return the Newton method as a function for JAX to compile."""
-    import jax
-    import jax.numpy as jnp
-    from jax import lax
-
-    stiffness = np.concatenate(_stiffness(arm, order, pieces))
-    bend = np.repeat([1.0, 0.0], 3 * (order + 1))
-    lengths = np.array([piece.length for piece in pieces])
-    rest, kind, parameters = arm.rest_lengths, arm.model.kind, arm.model.parameters
-    # A coefficient of curvature counts by the angle that it turns its segment, one of stretch as it is.
-    angle = np.where(bend, lengths[:, np.newaxis], 1.0).ravel()
-    unit = np.concatenate([angle / stiffness, 1.0 / rest])
-    turn = (bend * lengths[:, np.newaxis]).ravel()
-    tendon = kind == TENDON
-    size, muscles = stiffness.size, len(rest)
-
-    def energy(q: Any, tension: Any, load: Any) -> tuple[Any, Any]:
-        """Return the potential energy, muscles counted as tension times elongation of the path, and those elongations."""
-        tip = robot.forward_kinematics_tips(q)[-1]
-        weight = load[9] * load[6:9][AXES]
-        hanging = (load[0:3][AXES] + weight) @ tip[:3, 3] + weight @ (tip[:3, :3] @ load[10:13][AXES])
-        path = robot.actuators[0].path_lengths(robot, q) - rest if muscles else rest
-        # The protected energy: the public one brings its own derivative, which carries Jacobians and takes twice the time.
-        return 0.5 * q @ robot.elastic_force(q) + robot._gravitational_energy(q) - hanging + tension @ path, path
-
-    def residual(x: Any, drive: Any, load: Any) -> Any:
-        forces, path = jax.grad(energy, has_aux=True)(x[:size], x[size:], load)
-        # A tendon's own law is its whole equation.
-        gap = jnp.where(tendon, 0.0, path) - elongation(kind, parameters, rest, x[size:], drive)
-        return unit * jnp.concatenate([forces, gap])
-
-    def newton(q: Any, tension: Any, drive: Any, load: Any) -> Any:
-        def tangent_step(x: Any, r: Any) -> tuple[Any, Any]:
-            step = jnp.linalg.solve(jax.jacfwd(residual)(x, drive, load), r)
-            return step, jnp.minimum(1.0, MAX_BEND / jnp.max(turn * jnp.abs(step[:size])))
-
-        # One residual and one tangent in the compiled loop, not one for each place where Newton looks: that compiles faster.
-        def iterate(carry: Carry) -> Carry:
-            trial = carry.x - carry.factor * carry.step
-            r = residual(trial, drive, load)
-            norm = jnp.linalg.norm(r)
-            better = norm < (1.0 - 0.1 * carry.factor) * carry.norm
-            found = better & (jnp.max(jnp.abs(r)) <= RESIDUAL)
-            step, factor = lax.cond(better & ~found, lambda: tangent_step(trial, r), lambda: (carry.step, 0.5 * carry.factor))
-            return Carry(
-                x=jnp.where(better, trial, carry.x),
-                step=step,
-                factor=factor,
-                norm=jnp.where(better, norm, carry.norm),
-                halvings=jnp.where(better, 0, carry.halvings + 1),
-                evaluations=carry.evaluations + 1,
-                found=found,
-            )
-
-        def goes_on(carry: Carry) -> Any:
-            return ~carry.found & (carry.halvings <= MAX_HALVINGS) & (carry.evaluations < MAX_EVALUATIONS)
-
-        start = jnp.concatenate([q, tension])
-        end = lax.while_loop(goes_on, iterate, Carry(start, jnp.zeros_like(start), 0.0, jnp.inf, 0, 0, False))
-        pose = robot.forward_kinematics_tips(end.x[:size])[-1]
-        back = np.argsort(np.append(AXES, 3))
-        return end.x[:size], end.x[size:], pose[back][:, back], end.found
-
-    return newton
 
 
 METHOD = Method(

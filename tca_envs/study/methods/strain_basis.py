@@ -68,8 +68,9 @@ BEND_AND_TWIST = (0, 1, 2)
 
 TOLERANCE = 1e-7
 """Newton stops below this: an angle over a module, a strain, a mismatch of length over length."""
-NODES = 4
-"""Gauss nodes of a cell for constant strain, one more for each degree: quadratures are then better than the basis by far."""
+NODES, MORE = 4, 4
+"""Gauss nodes of a cell; and how many more the cells of a module share, for each piece at least one for each degree.
+Quadratures are better than the basis by far with these."""
 TURNS = 0.5
 """Turns of a helical muscle that a cell spans at most."""
 SLENDERNESS = 40.0
@@ -80,7 +81,7 @@ MAX_FALL = 200
 MAX_ROTATION_STEP = 0.5  # rad
 MAX_SHEAR_STEP = 0.5
 SMALLEST_SUBSTEP = 1.0 / 128.0
-REUSE = 0.3  # Newton keeps its factors as long as a step shrinks the residual to less than this
+REUSE = 0.1  # Newton keeps its factors as long as a step shrinks the residual to less than this
 ORIGIN = (0.0, 0.0, 0.0)
 SLOPE = np.sqrt(15.0) / 3.0
 WARM, SUBSTEPS, FALL, FAILED = 0, 1, 2, 3
@@ -792,7 +793,7 @@ def reduce(arm: Arm, allowed: Sequence[int], pieces: int, order: int) -> Basis:
         slenderness = module.length / np.sqrt(module.stiffness[:2].min() / module.stiffness[5])
         curl = module.length * float(np.linalg.norm(module.reference_strain[:3]))
         cells.append(max(1, ceil(turns / TURNS / pieces), ceil(slenderness / SLENDERNESS / pieces), ceil(curl / 2.0 / pieces)))
-        nodes.append(NODES + order)
+        nodes.append(NODES + ceil(max(order, MORE / pieces) / cells[-1]))
     most_nodes, most = max(nodes), max(c * n for c, n in zip(cells, nodes, strict=True))
     most_muscles = max(len(module.muscles) for module in modules)
     a, b = np.zeros((len(modules), most_nodes, most_nodes)), np.zeros((len(modules), most_nodes))
