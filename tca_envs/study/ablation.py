@@ -131,12 +131,10 @@ class Lane:
     """The compiled solve of a view from its state before, as a step of an environment calls it."""
 
     def __init__(self, arm: Arm, view: View) -> None:
-        found = on(arm, view.before)
-        assert found.nodes is not None
         self.arm, self.load = arm, view.now.load
-        self.known = [x[np.newaxis] for x in (found.nodes[1], found.tensions, *found.known)]
+        self.known = [x[np.newaxis] for x in arm.restart(on(arm, view.before))]
         self.drive = view.now.drive[np.newaxis]
-        self.answer = np.eye(4)[np.newaxis].copy(), np.empty((1, found.drive.size)), np.empty((1, 3))
+        self.answer = np.eye(4)[np.newaxis].copy(), np.empty((1, view.now.drive.size)), np.empty((1, 3))
 
     def __call__(self) -> float:
         """Return the time of a solve [s]; nan where it fails."""
@@ -212,7 +210,7 @@ def draw(scenes: Sequence[Scene], rows: Sequence[Row], path: Path) -> None:
     """Draw the tip errors into a PNG file, a panel for each scene."""
     from matplotlib.lines import Line2D
 
-    figure, panels = output.new_figure(len(scenes), 2.9 * len(scenes) + 1.4, 4.3, sharex=True, sharey=True)
+    figure, panels = output.new_figure(len(scenes), 2.9 * len(scenes) + 1.4, 4.5, sharex=True, sharey=True)
     for axes, scene in zip(panels, scenes, strict=True):
         draw_scene(axes, scene, [row for row in rows if row.scene == scene.name])
     panels[0].set_yticks(range(len(NAMES)), NAMES)
@@ -225,6 +223,8 @@ def draw(scenes: Sequence[Scene], rows: Sequence[Row], path: Path) -> None:
         Line2D([], [], **RADIUS_LINE, label="success radius"),
         Line2D([], [], **SHARE_LINE, label=f"{100 * SHARE:.0f} % of the success radius"),
         Line2D([], [], **TOLERANCE_LINE, label="default tolerance"),
+        Line2D([], [], linestyle="none", label=f"yaw: 95 %, if above {100 * SHARE:.0f} % of its limit"),
+        Line2D([], [], linestyle="none", label="time: without it, over with it"),
     ]  # fmt: skip
     figure.legend(handles=entries, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     output.save_figure(figure, path)
