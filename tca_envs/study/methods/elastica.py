@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from math import cos, pi, sin, sqrt
+from math import cos, inf, pi, sin, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -282,6 +282,10 @@ class Inputs:
     load: Array
     tension: Array
     factor: float = 1.0
+    slowest: float = inf
+    """Frequency of the slowest motion in the solve that `build` tries [rad/s]."""
+    last: float = inf
+    """The same of the last solve."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,8 +363,12 @@ class Relaxation:
                 stiffness = -float((moved * (there - before[1]) * rod.mass[2:]).sum())
                 if squared > 0.0 and stiffness > 0.0:
                     slowest = min(sqrt(stiffness / squared), 0.2 / self.time_step)
-            farthest = float(np.abs(there).max()) / slowest**2
-            if before is not None and farthest < self.way:
+            # What accelerates or still moves has a way to go; at a turning point only one of them shows. At first faster
+            # motions may hide the slow one: then the way is that of the slowest known.
+            slow = min(slowest, inputs.slowest)
+            way = float(np.abs(there).max()) / slow**2 + float(np.abs(rod.velocity_collection).max()) / slow
+            if before is not None and way < self.way:
+                inputs.last = slowest
                 return True
             before = here, there
         return False
@@ -416,7 +424,9 @@ def build(arm: Arm, elements: int, states: Sequence[State], matched: bool) -> Re
     step = partial(elastica.PositionVerlet().step, simulator, 0.0, time_step)
     way = REST * (arm.length / elements) ** 2 / arm.length
     solver = Relaxation(arm, rod, step, inputs, stiffness, matched, tip, time_step, way, unloaded, arcs)
-    step()
+    for state in states[:1]:
+        solver.solve(state, solver.cold())
+        inputs.slowest = inputs.last
     return solver
 
 

@@ -23,8 +23,9 @@ from math import ceil, pi, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tca_envs.mechanics import Arm, Equilibrium
+from tca_envs.mechanics import Arm, Equilibrium, Module
 from tca_envs.mechanics.collocation import LOAD
 from tca_envs.mechanics.muscle import COIL, SPRING, TENDON
 from tca_envs.study.method import Answer, Array, Method, State
@@ -36,6 +37,7 @@ MAX_HALVINGS = 6
 MAX_BEND = 1.0
 """A Newton step turns no coefficient's strain by more than this over the segment's length [rad]."""
 MAX_SUBSTEPS = 60
+SMALLEST_SUBSTEP = 1.0 / 256.0
 LIGHT = 1e-9
 """Mass per length of a weightless module [kg/m]: the package wants a positive one."""
 AXES = np.array([2, 0, 1])
@@ -121,15 +123,34 @@ class Strains:
                     return Answer(True, np.asarray(pose), known)
             else:
                 step *= 0.25
+                if step < SMALLEST_SUBSTEP:
+                    break
         return Answer(False, np.eye(4), None)
 
 
 def build(arm: Arm, order: int, states: Sequence[State]) -> Strains:
     """Return the model with strains of polynomial order `order`, compiled."""
+    modules = tuple(
+        (m.length, tuple(m.stiffness), m.mass_per_length, m.muscles, tuple(m.reference_strain)) for m in arm.modules
+    )
+    solver = Strains(arm, order, _pieces(arm), _compiled(modules, tuple(arm.gravity), order))
+    for state in states[:1]:
+        solver.solve(state, solver.cold())
+    return solver
+
+
+@cache
+def _compiled(modules: tuple[Any, ...], gravity: tuple[float, ...], order: int) -> Callable[..., Any]:
+    """Return the Newton method of an arm with these numbers.
+
+    They are constants in what is compiled: as arguments they would let arms share it, but cost a third of the speed.
+    """
     import jax
-    import jax.numpy as jnp
 
     jax.config.update("jax_enable_x64", True)
+    arm = Arm(
+        [Module(length, np.array(k), mass, muscles, np.array(strain)) for length, k, mass, muscles, strain in modules], gravity
+    )
     pieces = _pieces(arm)
     bends = np.repeat([1.0, 0.0], 3 * (order + 1))
     lengths = np.array([piece.length for piece in pieces])[:, np.newaxis]
@@ -137,11 +158,7 @@ def build(arm: Arm, order: int, states: Sequence[State]) -> Strains:
     angle = np.where(bends, lengths, 1.0).ravel()
     unit = np.concatenate([angle / np.concatenate(_stiffness(arm, order, pieces)), 1.0 / arm.rest_lengths])
     numbers = Numbers(unit, (bends * lengths).ravel(), arm.rest_lengths, arm.model.kind, arm.model.parameters)
-    newton = partial(_package().newton, _robot(arm, order, pieces), jax.tree.map(jnp.asarray, numbers))
-    solver = Strains(arm, order, pieces, newton)
-    for state in states[:1]:
-        solver.solve(state, solver.cold())
-    return solver
+    return jax.jit(partial(_package().newton, _robot(arm, order, pieces), numbers))
 
 
 def _pieces(arm: Arm) -> tuple[Piece, ...]:
@@ -161,19 +178,19 @@ def _stiffness(arm: Arm, order: int, pieces: Sequence[Piece]) -> list[Array]:
 
 
 class Numbers(NamedTuple):
-    """An arm's numbers that the Newton method reads beside the package's model; arrays, in the package's axes."""
+    """An arm's numbers that the Newton method reads beside the package's model."""
 
-    unit: Any
+    unit: Array
     """What makes residuals dimensionless: of forces (coefficients,), then of lengths (n,)."""
-    turn: Any
+    turn: Array
     """Angle by which a coefficient turns its segment (coefficients,) [rad m]; 0 for stretch."""
-    rest: Any
-    kind: Any
-    parameters: Any
+    rest: Array
+    kind: NDArray[np.int64]
+    parameters: Array
 
 
 class Package(NamedTuple):
-    """What needs the package to be defined: made once, so that arms of one structure share what is compiled."""
+    """What needs the package to be defined."""
 
     paths: Callable[..., Any]
     """(offset, angle, rate, base, first segment, last segment), all (n,) -> the package's routes of muscles."""
@@ -240,7 +257,6 @@ def _package() -> Package:
         gap = gap - elongation(numbers.kind, numbers.parameters, numbers.rest, tension, drive)
         return numbers.unit * jnp.concatenate([forces, gap])
 
-    @eqx.filter_jit
     def newton(robot: Any, numbers: Numbers, q: Any, tension: Any, drive: Any, load: Any) -> Any:
         def tangent_step(x: Any, r: Any) -> tuple[Any, Any]:
             step = jnp.linalg.solve(jax.jacfwd(residual)(x, drive, load, robot, numbers), r)
@@ -318,12 +334,12 @@ def _robot(arm: Arm, order: int, pieces: Sequence[Piece]) -> Any:
     )
 
 
-def elongation(kind: Any, parameters: Any, rest: Any, tension: Any, drive: Any) -> Any:
+def elongation(kind: NDArray[np.int64], parameters: Array, rest: Array, tension: Any, drive: Any) -> Any:
     """Return the elongations (n,) [m] of `muscle.elongation`, in JAX; of a tendon (tension - drive), a law that asks for it.
 
     Parameters
     ----------
-    kind, parameters, rest : (n,), (n, PARAMETERS), (n,) JAX arrays
+    kind, parameters, rest : (n,), (n, PARAMETERS), (n,) arrays
         As in `collocation.Model`.
     tension, drive : (n,) JAX arrays
         [N]; temperature [degC], rest length [m] or tension [N].
