@@ -8,6 +8,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from tca_envs import presets
+from tca_envs.mechanics import Arm
 from tca_envs.mechanics.thermal import SOFT_LIMIT
 from tca_envs.tasks import TASKS
 from tca_envs.tasks.core import solved
@@ -26,6 +28,9 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         "sparse" or "dense".
     split : str
         Where goals come from: "train" or "held-out".
+    tolerance : float
+        Largest error of the arm's tip [m], 1e-9 to 1e-3. The cheapest discretisation that keeps to it over the task's states
+        is chosen; `env.unwrapped.arm.discretisation` prints it.
 
     Raises
     ------
@@ -33,14 +38,16 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         If an argument is none of these.
     """
 
-    def __init__(self, task: str = "reach", reward: str = "sparse", split: str = "train") -> None:
+    def __init__(
+        self, task: str = "reach", reward: str = "sparse", split: str = "train", tolerance: float = presets.TOLERANCE
+    ) -> None:
         if not isinstance(task, str) or task not in TASKS:
             raise ValueError(f"task = {task!r}: expected one of {', '.join(map(repr, TASKS))}")
         if not isinstance(reward, str) or reward not in REWARDS:
             raise ValueError(f"reward = {reward!r}: expected one of {', '.join(map(repr, REWARDS))}")
         self.metadata = {"render_modes": []}
         self.reward = reward
-        self.task = TASKS[task](split)
+        self.task = TASKS[task](split, tolerance)
         self.core = self.task.core(1)
         self.action_space = spaces.Box(-1.0, 1.0, (self.task.actions,), np.float32)
         self.observation_space = spaces.Dict(
@@ -87,6 +94,11 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         else:
             reward = self.task.dense_reward(achieved_goal, desired_goal)
         return float(reward) if np.ndim(reward) == 0 else reward.astype(np.float32)
+
+    @property
+    def arm(self) -> Arm:
+        """The arm's mechanics."""
+        return self.core.arm
 
     def get_state(self) -> dict[str, Any]:
         """Return the episode, to the last bit, as arrays by name and the state of the random generator ("rng").

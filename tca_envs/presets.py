@@ -4,13 +4,17 @@ Sources: Sun & Zhao, "Modeling and Simulation of Soft Robots driven by Artificia
 that add up to the arm's measured 6 g.
 """
 
+from collections.abc import Callable
+from functools import cache
+from itertools import product
 from math import pi
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tca_envs.mechanics import TCA, Arm, Grid, Gripper, Module, Muscle, Payload, check
+from tca_envs.mechanics import TCA, Arm, Gripper, Module, Muscle, Payload, check, discretise
 from tca_envs.mechanics.grasp import Box, Site
+from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
 
 YOUNGS_MODULUS = 0.125e6
 """Ecoflex 30 [Pa] (paper, section IV)."""
@@ -67,6 +71,11 @@ SITE = Site(86.8e-3, STAGE_TRAVEL, GRIPPER_WIDTH, GRIPPER_THICKNESS, GRAVITY[2])
 BELOW_BENDING = Payload(TWISTING_MASS + GRIPPER_MASS, (0.0, 0.0, 12e-3))
 """Twisting module and gripper as a rigid body: centre of mass 12 mm below the bending module's tip (estimate)."""
 
+TOLERANCE = 1e-5
+"""Default tip error [m]: a hundredth of the smallest success radius."""
+STATES = 160
+"""So many states of a scene decide on its discretisation."""
+
 
 def bending_module(tca: TCA | None = None) -> Module:
     """Return the paper's 3D bending module: three straight TCAs around a soft cylinder."""
@@ -103,22 +112,33 @@ def with_object(place: ArrayLike = (0.0, 0.0, JAW_DEPTH)) -> Payload:
     return Payload(mass, (x, y, z))
 
 
-def whole_arm(tca: TCA | None = None, payload: Payload | None = None) -> Arm:
+def whole_arm(tca: TCA | None = None, payload: Payload | None = None, tolerance: float = TOLERANCE) -> Arm:
     """Return bending and twisting module in series with the gripper's weight at the end, or another payload.
 
-    The strain of a helical muscle's module turns with the muscle, so that module has six elements, less than a turn each.
-    The tip lies within 10 um of that of a grid ten times finer at all temperatures up to the heaters' cut-off
-    (tests/test_benchmark.py); a smaller tolerance would not bring it nearer.
+    Parameters
+    ----------
+    tca : TCA, optional
+        Parameter set of all TCAs; the measured one by default.
+    payload : Payload, optional
+        What hangs from the twisting module's end instead of the empty gripper.
+    tolerance : float
+        Largest tip error [m], with this payload and with the object in the gripper's jaws; see `mechanics.discretise`.
     """
-    modules = [bending_module(tca), twisting_module(tca)]
-    hanging = payload or Payload(GRIPPER_MASS, GRIPPER_CENTRE)
-    return Arm(modules, GRAVITY, hanging, [Grid(1, 7), Grid(6, 4)], residual_tolerance=1e-5)
+    modules = (bending_module, twisting_module)
+    return _scene(modules, tca or TCA(), payload or Payload(GRIPPER_MASS, GRIPPER_CENTRE), with_object(), tolerance)
 
 
-def bending_arm(tca: TCA | None = None) -> Arm:
-    """Return the bending module with the rest of the arm hanging from it as a rigid body.
+def bending_arm(tca: TCA | None = None, tolerance: float = TOLERANCE) -> Arm:
+    """Return the bending module with the rest of the arm hanging from it as a rigid body; parameters as of `whole_arm`."""
+    return _scene((bending_module,), tca or TCA(), BELOW_BENDING, BELOW_BENDING, tolerance)
 
-    One element of 7 Gauss nodes: the tip lies within 1 um of that of a grid ten times finer at all temperatures up to the
-    hard limit (tests/test_benchmark.py).
-    """
-    return Arm([bending_module(tca)], GRAVITY, BELOW_BENDING, [Grid(1, 7)], residual_tolerance=1e-6)
+
+@cache
+def _scene(modules: tuple[Callable[[TCA], Module], ...], tca: TCA, payload: Payload, other: Payload, tolerance: float) -> Arm:
+    """Return a hanging arm for all temperatures up to the hard limit, with either payload: corners and random ones."""
+    arm = Arm([module(tca) for module in modules], GRAVITY, payload)
+    rng = np.random.default_rng(0)
+    corners = list(product((AMBIENT, HARD_LIMIT), repeat=len(arm.muscles)))
+    drives = np.vstack([corners, rng.uniform(AMBIENT, HARD_LIMIT, (STATES - len(corners), len(arm.muscles)))])
+    loads = [arm.load(payload=other if i % 2 else payload) for i in range(STATES)]
+    return discretise(arm, tolerance, drives, np.array(loads))

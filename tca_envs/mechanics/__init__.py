@@ -1,8 +1,12 @@
 """Physics of the arm: muscles, modules, equilibrium, heating. Knows no Gymnasium."""
 
-from tca_envs.mechanics.arm import Arm, Grid, Module, Payload
+from tca_envs.mechanics.arm import Arm, Discretisation, Grid, Module, Payload
+from tca_envs.mechanics.discretisation import discretise
 from tca_envs.mechanics.equilibrium import Equilibrium
 from tca_envs.mechanics.gripper import Gripper
 from tca_envs.mechanics.muscle import TCA, Muscle, Spring, Tendon
 
-__all__ = ["TCA", "Arm", "Equilibrium", "Grid", "Gripper", "Module", "Muscle", "Payload", "Spring", "Tendon"]
+__all__ = [
+    "TCA", "Arm", "Discretisation", "Equilibrium", "Grid", "Gripper", "Module", "Muscle", "Payload", "Spring", "Tendon",
+    "discretise",
+]  # fmt: skip

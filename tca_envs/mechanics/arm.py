@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from math import ceil, hypot
 from operator import index as as_integer
 from typing import NamedTuple
@@ -9,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tca_envs.mechanics import check, section
+from tca_envs.mechanics import check, closed_form, section
+from tca_envs.mechanics.closed_form import CLOSED_FORM
 from tca_envs.mechanics.collocation import (
     FAILED,
     FALL,
@@ -85,7 +87,7 @@ class Module:
         object.__setattr__(self, "muscles", muscles)
         fractions = np.linspace(0.0, 1.0, 181)
         for i, muscle in enumerate(muscles):
-            shortest = min(self._stretch(muscle, x) for x in fractions)
+            shortest = self._stretch(muscle, fractions).min()
             if not shortest > 1e-3:
                 raise ValueError(
                     f"muscles[{i}] = {muscle!r}: expected a path that runs along the module; with reference_strain "
@@ -128,24 +130,23 @@ class Module:
         stiffness = np.array([e * inertia, e * inertia, 2.0 * g * inertia, g * area, g * area, e * area])
         return cls(length, stiffness, mass / length, muscles, np.array([*u, 0.0, 0.0, 1.0]))
 
-    def route(self, muscle: Muscle, fraction: float) -> Array:
-        """Return x, y [m] of a muscle in the cross section and their derivatives in s, at s = fraction * length; (4,)."""
+    def route(self, muscle: Muscle, fraction: float | Array) -> Array:
+        """Return x, y [m] of a muscle in the section and their derivatives in s, at s = fraction * length; (..., 4)."""
         rate = 2.0 * np.pi * muscle.turns / self.length
         angle = muscle.angle + rate * self.length * fraction
         x, y = muscle.offset * np.cos(angle), muscle.offset * np.sin(angle)
-        return np.array([x, y, -rate * y, rate * x])
+        return np.stack([x, y, -rate * y, rate * x], axis=-1)
 
-    def _stretch(self, muscle: Muscle, fraction: float) -> float:
+    def _stretch(self, muscle: Muscle, fractions: Array) -> Array:
         """Return |p_a'| of the unloaded rod, eq. (13)."""
-        x, y, dx, dy = self.route(muscle, fraction)
+        x, y, dx, dy = self.route(muscle, fractions).T
         u, v = self.reference_strain[:3], self.reference_strain[3:]
-        return float(np.linalg.norm([v[0] - u[2] * y + dx, v[1] + u[2] * x + dy, v[2] + u[0] * y - u[1] * x]))
+        return np.linalg.norm([v[0] - u[2] * y + dx, v[1] + u[2] * x + dy, v[2] + u[0] * y - u[1] * x], axis=0)
 
-    def rest_length(self, muscle: Muscle, nodes: int = 64) -> float:
+    def rest_length(self, muscle: Muscle) -> float:
         """Return the path length of a muscle in the unloaded rod [m], l* of eq. (24), by Gauss quadrature."""
-        points, weights = np.polynomial.legendre.leggauss(nodes)
-        stretches = [self._stretch(muscle, x) for x in (points + 1.0) / 2.0]
-        return 0.5 * self.length * float(weights @ stretches)
+        points, weights = legendre_nodes(64)
+        return 0.5 * self.length * float(weights @ self._stretch(muscle, 0.5 * (points + 1.0)))
 
 
 @dataclass(frozen=True)
@@ -178,9 +179,52 @@ class Grid(NamedTuple):
 MAX_NODES = 16
 
 
+@dataclass(frozen=True)
+class Discretisation:
+    """How an arm is discretised, and how accurate that is.
+
+    Attributes
+    ----------
+    grids : tuple of Grid
+        One for each module.
+    residual_tolerance : float
+        Newton stops when `Equilibrium.residual` is below it.
+    closed_form : bool
+        Whether nothing is integrated where nothing loads the arm.
+    tolerance, error : float or None
+        Tip error that was asked for and its estimate [m]; None if grids were given and nothing was estimated.
+    states : int
+        On so many states the estimate rests.
+    """
+
+    grids: tuple[Grid, ...]
+    residual_tolerance: float
+    closed_form: bool
+    tolerance: float | None = None
+    error: float | None = None
+    states: int = 0
+
+    def __str__(self) -> str:
+        lines = [f"module {k}: {e} x {q} Gauss nodes" for k, (e, q) in enumerate(self.grids)]
+        lines.append(f"Newton stops at a residual of {self.residual_tolerance:.1e}")
+        lines.append(f"closed form without load: {'yes' if self.closed_form else 'no'}")
+        if self.tolerance is None or self.error is None:
+            lines.append("tip error: not estimated, the grids were given")
+        else:
+            lines.append(f"tip error: {self.error:.1e} m estimated from {self.states} states, {self.tolerance:.1e} m asked")
+        return "\n".join(lines)
+
+
+@cache
+def legendre_nodes(count: int) -> tuple[Array, Array]:
+    """Return nodes and weights of Gauss quadrature on [-1, 1]."""
+    return np.polynomial.legendre.leggauss(count)
+
+
+@cache
 def gauss(nodes: int) -> tuple[Array, Array, Array]:
     """Return the Gauss collocation coefficients a (q, q), weights b (q,) and nodes c (q,) on [0, 1]."""
-    x, w = np.polynomial.legendre.leggauss(nodes)
+    x, w = legendre_nodes(nodes)
     return integrals((x + 1.0) / 2.0, (x + 1.0) / 2.0), w / 2.0, (x + 1.0) / 2.0
 
 
@@ -189,8 +233,34 @@ def integrals(c: Array, x: Array) -> Array:
     q = len(c)
     legendre = np.polynomial.legendre
     vandermonde = legendre.legvander(2.0 * c - 1.0, q - 1)
-    columns = [legendre.legval(2.0 * x - 1.0, legendre.legint(np.eye(q)[k], lbnd=-1.0)) / 2.0 for k in range(q)]
-    return np.asarray(np.linalg.solve(vandermonde.T, np.array(columns)).T, dtype=np.float64)
+    columns = legendre.legval(2.0 * x - 1.0, legendre.legint(np.eye(q), lbnd=-1.0)) / 2.0
+    return np.asarray(np.linalg.solve(vandermonde.T, columns).T, dtype=np.float64)
+
+
+@cache
+def interpolation(here: Grid, there: Grid) -> Array:
+    """Return the matrix (G', G) that takes values at the nodes of one grid of a module to those of another.
+
+    By the Lagrange polynomials of the element that a node lies in.
+    """
+    vandermonde = np.polynomial.legendre.legvander
+    x = ((np.arange(there.elements)[:, np.newaxis] + gauss(there.nodes)[2]) / there.elements * here.elements).ravel()
+    element = np.minimum(x.astype(int), here.elements - 1)
+    basis = vandermonde(2.0 * gauss(here.nodes)[2] - 1.0, here.nodes - 1)
+    weights = np.linalg.solve(basis.T, vandermonde(2.0 * (x - element) - 1.0, here.nodes - 1).T).T
+    result = np.zeros((len(x), here.elements, here.nodes))
+    result[np.arange(len(x)), element] = weights
+    return result.reshape(len(x), -1)
+
+
+def carried(here: Sequence[Grid], strain: Array, there: Sequence[Grid]) -> Array:
+    """Return strains (..., G, 6) at the nodes of an arm's grids `here` interpolated to those of other grids, (..., G', 6)."""
+    parts, first = [], 0
+    for old, new in zip(here, there, strict=True):
+        last = first + old.elements * old.nodes
+        parts.append(interpolation(old, new) @ strain[..., first:last, :])
+        first = last
+    return np.concatenate(parts, axis=-2)
 
 
 def default_grid(module: Module) -> Grid:
@@ -247,6 +317,10 @@ class Arm:
         self.length = sum(module.length for module in self.modules)
         self.muscles = tuple(muscle for module in self.modules for muscle in module.muscles)
         self.model, self.node_arc = _compile(self.modules, self.grids, self.residual_tolerance)
+        self.sections = _sections(self.modules, self.grids, self.node_arc)
+        massless = not any(module.mass_per_length for module in self.modules)
+        self._weightless = self.sections is not None and (massless or not self.gravity.any())
+        self.discretisation = Discretisation(self.grids, self.residual_tolerance, self.sections is not None)
         ranges = [muscle.law.drive_range() for muscle in self.muscles]
         self._lowest, self._highest = [low for low, _ in ranges], [high for _, high in ranges]
         found = f"converged below {self.residual_tolerance:g}"
@@ -254,6 +328,7 @@ class Arm:
             WARM: found,
             SUBSTEPS: f"{found} in substeps of drive and load",
             FALL: f"{found} after a fall from the end of the start's branch",
+            CLOSED_FORM: "closed form: nothing loads the arm",
             FAILED: "no equilibrium found by Newton, substeps or a damped fall; this is the start's shape",
         }
         self._neutral = np.array(
@@ -281,6 +356,10 @@ class Arm:
         if tip_moment is not ZERO:
             load[3:6] = check.array("tip_moment", tip_moment, (3,))
         return load
+
+    def unstressed(self, load: Array) -> bool:
+        """Return whether `closed_form` applies: nothing loads the arm, and its modules' strains are uniform then."""
+        return self._weightless and not load[:6].any() and not (load[PAYLOAD_MASS] and self.gravity.any())
 
     def unloaded(self) -> tuple[Array, Array, Array, Array]:
         """Return strain (G, 6), tension (n,), drive (n,) and load of the unloaded arm: where every cold start begins."""
@@ -328,12 +407,14 @@ class Arm:
         if start is None:
             strain, tension, from_drive, from_load = self.unloaded()
         else:
-            strain, tension, from_drive, from_load = self._restart(start)
+            strain, tension, from_drive, from_load = self.restart(start)
         tip, lengths, report = EYE.copy(), np.empty((1, drive.size)), np.empty((1, 3))
-        solve_lanes(
-            self.model, strain[np.newaxis], tension[np.newaxis], from_drive[np.newaxis], from_load[np.newaxis],
+        lane = (
+            strain[np.newaxis], tension[np.newaxis], from_drive[np.newaxis], from_load[np.newaxis],
             drive[np.newaxis], load[np.newaxis], tip, lengths, report,
         )  # fmt: skip
+        if not (self.unstressed(load) and closed_form.solve_lane(self.model, self.sections, *lane)):
+            solve_lanes(self.model, *lane)
         rung, residual, iterations = report[0].tolist()
         converged = rung != FAILED
         if not converged:
@@ -368,7 +449,14 @@ class Arm:
                 )
         return result
 
-    def _restart(self, start: Equilibrium) -> tuple[Array, Array, Array, Array]:
+    def restart(self, start: Equilibrium) -> tuple[Array, Array, Array, Array]:
+        """Return strain (G, 6) on this arm's grid, tension (n,), drive (n,) and load of an equilibrium, as copies.
+
+        Raises
+        ------
+        ValueError
+            For a start with another number of muscles or another length.
+        """
         if not isinstance(start, Equilibrium):
             raise ValueError(f"start = {start!r}: expected an Equilibrium or None")
         if start.tensions.shape != (len(self.muscles),) or abs(start.length - self.length) > 1e-9 * self.length:
@@ -377,10 +465,16 @@ class Arm:
                 f"arm, with {len(self.muscles)} and {self.length:g} m"
             )
         from_drive, from_load = start.known
-        if start.nodes is not None and start.nodes[0] is self.model:
-            strain = start.nodes[1].copy()
-        else:
+        if start.nodes is None:
             strain = start.strain(self.node_arc)
+        else:
+            model, nodes = start.nodes
+            if model is self.model:
+                strain = nodes.copy()
+            elif np.array_equal(model.length, self.model.length):
+                strain = carried([Grid(e, q) for e, q in zip(model.elements, model.nodes, strict=True)], nodes, self.grids)
+            else:
+                strain = start.strain(self.node_arc)
         return strain, start.tensions.copy(), from_drive.copy(), from_load.copy()
 
 
@@ -483,26 +577,48 @@ def _checked(grids: Sequence[Grid], modules: int) -> tuple[Grid, ...]:
     return result
 
 
+def _sections(modules: tuple[Module, ...], grids: tuple[Grid, ...], node_arc: Array) -> closed_form.Sections | None:
+    """Return the modules' sections for `closed_form`, or None where a module's strain is not uniform without load.
+
+    It is where all muscles run straight, and also where all turn at the same rate around a rod that looks alike from all sides.
+    """
+    turn = np.zeros(len(modules))
+    for k, module in enumerate(modules):
+        turns = {muscle.turns for muscle in module.muscles if muscle.offset > 0.0}
+        axial = not module.reference_strain[[0, 1, 3, 4]].any()
+        alike = axial and module.stiffness[0] == module.stiffness[1] and module.stiffness[3] == module.stiffness[4]
+        if len(turns) > 1 or (any(turns) and not alike):
+            return None
+        turn[k] = 2.0 * np.pi * sum(turns) / module.length
+    routes = [module.route(muscle, 0.0) for module in modules for muscle in module.muscles]
+    lever, slope = np.zeros((len(routes), 3, 6)), np.zeros((len(routes), 3))
+    for i, (x, y, dx, dy) in enumerate(routes):
+        lever[i] = np.hstack([-section.cross_matrix(np.array([x, y, 0.0])), np.eye(3)])
+        slope[i, :2] = dx, dy
+    bases = np.cumsum([0.0, *(module.length for module in modules[:-1])])
+    arc = node_arc - np.repeat(bases, [grid.elements * grid.nodes for grid in grids])
+    return closed_form.Sections(lever, slope, turn, arc)
+
+
 def _compile(modules: tuple[Module, ...], grids: tuple[Grid, ...], tolerance: float) -> tuple[Model, Array]:
     """Return the arm as plain arrays for the kernels, and the arc positions of its nodes (G,) [m]."""
     most_nodes = max(grid.nodes for grid in grids)
     most_muscles = max(len(module.muscles) for module in modules)
     a, b = np.zeros((len(modules), most_nodes, most_nodes)), np.zeros((len(modules), most_nodes))
     routes: list[Array] = []
-    mass_below: list[float] = []
-    arc: list[float] = []
+    mass_below: list[Array] = []
+    arc: list[Array] = []
     base = 0.0
     for k, (module, (elements, q)) in enumerate(zip(modules, grids, strict=True)):
         a[k, :q, :q], b[k, :q], c = gauss(q)
         beyond = sum(m.mass_per_length * m.length for m in modules[k + 1 :])
-        for piece in range(elements):
-            for x in (piece + c) / elements:
-                route = np.zeros((most_muscles, 4))
-                for i, muscle in enumerate(module.muscles):
-                    route[i] = module.route(muscle, x)
-                routes.append(route)
-                mass_below.append(beyond + module.mass_per_length * module.length * (1.0 - x))
-                arc.append(base + x * module.length)
+        x = ((np.arange(elements)[:, np.newaxis] + c) / elements).ravel()
+        route = np.zeros((len(x), most_muscles, 4))
+        for i, muscle in enumerate(module.muscles):
+            route[:, i] = module.route(muscle, x)
+        routes.append(route)
+        mass_below.append(beyond + module.mass_per_length * module.length * (1.0 - x))
+        arc.append(base + module.length * x)
         base += module.length
     muscles = [(module, muscle) for module in modules for muscle in module.muscles]
     model = Model(
@@ -514,11 +630,12 @@ def _compile(modules: tuple[Module, ...], grids: tuple[Grid, ...], tolerance: fl
         stiffness=np.array([module.stiffness for module in modules]),
         reference=np.array([module.reference_strain for module in modules]),
         first_muscle=np.cumsum([0] + [len(module.muscles) for module in modules]).astype(np.int64),
-        route=np.array(routes),
-        mass_below=np.array(mass_below),
+        route=np.concatenate(routes),
+        mass_below=np.concatenate(mass_below),
         kind=np.array([muscle.law.kind for _, muscle in muscles], dtype=np.int64),
         parameters=np.array([muscle.law.parameters() for _, muscle in muscles]).reshape(-1, PARAMETERS),
         rest_length=np.array([module.rest_length(muscle) for module, muscle in muscles]),
         tolerance=tolerance,
+        ladder=True,
     )
-    return model, np.array(arc)
+    return model, np.concatenate(arc)

@@ -84,6 +84,7 @@ class Model(NamedTuple):
     parameters: Array  # (n, PARAMETERS) of muscle law
     rest_length: Array  # (n,) [m]
     tolerance: float  # Newton stops when the dimensionless residual is below this (see `evaluate`)
+    ladder: bool  # whether `solve` goes on where Newton fails
 
 
 class Workspace(NamedTuple):
@@ -665,13 +666,14 @@ def substitute(model, ws):
 
 
 @inner
-def newton(model, strain, tension, drive, load, damping, ws):
+def newton(model, strain, tension, drive, load, damping, moved, ws):
     """Solve by Newton from (strain, tension), in place.
 
     Without `damping`, Newton must go straight to the answer: it gives up if a step turns a section by more than
     MAX_ROTATION_STEP or if it takes long, because a solve that has to be steered may end on another branch of equilibria.
     With `damping`, each step is one of linearly implicit Euler for a rod with viscosity proportional to K, its time step
-    growing as the residual falls (pseudo-transient continuation): the fall of a real, strongly damped arm. There is one
+    growing as the residual falls (pseudo-transient continuation): the fall of a real, strongly damped arm. What has `moved`,
+    drive or load, takes a step even where the start would do: a small change moves the arm a little, not in jerks. There is one
     call of `evaluate` for all this, because the compiler inlines every call.
 
     Returns
@@ -685,7 +687,7 @@ def newton(model, strain, tension, drive, load, damping, ws):
     while True:
         before = worst
         worst, new_total = evaluate(model, strain, tension, drive, load, iterations > 0, ws)
-        if worst < model.tolerance:
+        if worst < model.tolerance and (iterations > 0 or not moved):
             return True, worst, iterations
         if not worst < np.inf or iterations == (MAX_FALL if falling else MAX_ITERATIONS):
             return False, worst, iterations
@@ -730,14 +732,18 @@ def solve(model, strain, tension, from_drive, from_load, drive, load, ws):
     strain0, tension0 = strain.copy(), tension.copy()
     good_strain, good_tension = strain0.copy(), tension0.copy()
     drive_now, load_now = drive.copy(), load.copy()
-    done, step, spent, rung, damping = 0.0, 1.0, 0, WARM, 0.0
+    done, step, spent, rung, damping, moved = 0.0, 1.0, 0, WARM, 0.0, False
+    for i in range(drive.size):
+        moved |= drive[i] != from_drive[i]
+    for i in range(load.size):
+        moved |= load[i] != from_load[i]
     while True:
         here = min(1.0, done + step)
         for i in range(drive.size):
             drive_now[i] = drive[i] if here == 1.0 else from_drive[i] + here * (drive[i] - from_drive[i])
         for i in range(load.size):
             load_now[i] = load[i] if here == 1.0 else from_load[i] + here * (load[i] - from_load[i])
-        converged, worst, iterations = newton(model, strain, tension, drive_now, load_now, damping, ws)
+        converged, worst, iterations = newton(model, strain, tension, drive_now, load_now, damping, moved, ws)
         spent += iterations
         if converged:
             if here == 1.0:
@@ -746,7 +752,7 @@ def solve(model, strain, tension, from_drive, from_load, drive, load, ws):
             good_strain[:] = strain
             good_tension[:] = tension
             continue
-        if rung == FALL:
+        if rung == FALL or not model.ladder:
             strain[:] = strain0
             tension[:] = tension0
             return FAILED, worst, spent
@@ -758,7 +764,6 @@ def solve(model, strain, tension, from_drive, from_load, drive, load, ws):
             rung, step, damping = FALL, 1.0, FIRST_DAMPING
 
 
-@entry
 def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report):
     """Solve N arms of one model, each from its own known equilibrium.
 
@@ -779,6 +784,19 @@ def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip,
     report : (N, 3) array
         Out: rung (WARM, SUBSTEPS, FALL or FAILED), dimensionless residual, Newton iterations.
     """
+    _solve_lanes(*model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report)
+
+
+@entry
+def _solve_lanes(
+    elements, nodes, length, a, b, stiffness, reference, first_muscle, route, mass_below, kind, parameters, rest_length,
+    tolerance, ladder, strain, tension, from_drive, from_load, drive, load, tip, lengths, report,
+):  # fmt: skip
+    """`solve_lanes` with the model's fields one by one: of a NamedTuple Numba works out the type at every call, in 3 us."""
+    model = Model(
+        elements, nodes, length, a, b, stiffness, reference, first_muscle, route, mass_below, kind, parameters, rest_length,
+        tolerance, ladder,
+    )  # fmt: skip
     ws = workspace(model)
     for lane in range(strain.shape[0]):
         rung, worst, iterations = solve(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tca_envs.mechanics import check
+from tca_envs.mechanics.collocation import Model
 
 Array = NDArray[np.float64]
 
@@ -54,8 +55,8 @@ class Equilibrium:
     """Arc positions (k,) -> poses (k, 4, 4), strains (k, 6)."""
     differentiate: Callable[[], Array] = field(repr=False)
     """() -> d(tip position, tip rotation vector)/d drive (6, n)."""
-    nodes: tuple[object, Array] | None = field(default=None, repr=False)
-    """The arm's compiled model and the strains at its nodes: a warm start for that same model."""
+    nodes: tuple[Model, Array] | None = field(default=None, repr=False)
+    """The arm's compiled model and the strains at its nodes: what a warm start reads."""
 
     def poses(self, s: ArrayLike) -> Array:
         """Return the poses (len(s), 4, 4) of the cross sections at arc positions `s` in [0, length] of the unloaded arm [m]."""

@@ -1,9 +1,12 @@
 """Strain of a cross section from the wrench that it carries: six algebraic equations."""
 
+from math import sqrt
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+EYE = np.eye(3)
 
 
 def cross_matrix(x: Array) -> Array:
@@ -33,15 +36,16 @@ def balance(
         Imbalance (6,) and H (6, 6), symmetric, positive definite for tensions >= 0.
     """
     imbalance = stiffness * (strain - reference) - wrench
-    tangent = np.diag(stiffness).copy()
-    for (x, y, dx, dy), force in zip(route, tension, strict=True):
-        r = np.array([x, y, 0.0])
-        path = strain[3:] + np.cross(strain[:3], r) + np.array([dx, dy, 0.0])
-        norm = np.linalg.norm(path)
+    tangent = np.diag(stiffness)
+    u_x, u_y, u_z, v_x, v_y, v_z = strain.tolist()
+    for (x, y, dx, dy), force in zip(route.tolist(), tension.tolist(), strict=True):
+        # p' = v + u x r + r', r = (x, y, 0)
+        path = np.array([v_x - u_z * y + dx, v_y + u_z * x + dy, v_z + u_x * y - u_y * x])
+        norm = sqrt(path @ path)
         t = path / norm
-        imbalance += force * np.concatenate([np.cross(r, t), t])
-        b = np.hstack([-cross_matrix(r), np.eye(3)])
-        tangent += force / norm * b.T @ (np.eye(3) - np.outer(t, t)) @ b
+        b = np.array([[0.0, 0.0, -y, 1.0, 0.0, 0.0], [0.0, 0.0, x, 0.0, 1.0, 0.0], [y, -x, 0.0, 0.0, 0.0, 1.0]])
+        imbalance += force * (b.T @ t)
+        tangent += force / norm * b.T @ (EYE - np.outer(t, t)) @ b
     return imbalance, tangent
 
 

@@ -147,7 +147,7 @@ def equilibrium(
         tendon = [muscle.law.kind == TENDON for muscle in arm.muscles]
         guess = np.concatenate([base, np.where(tendon, problem.drive, 0.0)])
     else:
-        arm._restart(start)  # refuses a start of another arm
+        arm.restart(start)  # refuses a start of another arm
         guess = np.concatenate([start.strain([0.0])[0], start.tensions])
     with np.errstate(all="ignore"):
         unknowns, report = find_root(problem, guess)

@@ -11,15 +11,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def require_matplotlib() -> None:
-    """Raise ModuleNotFoundError, with what to do, where matplotlib is missing."""
-    if find_spec("matplotlib") is None:
-        raise ModuleNotFoundError("drawing needs matplotlib, which is in the extra `train`: pip install 'tca_envs[train]'")
+def require(package: str) -> None:
+    """Raise ModuleNotFoundError, with what to do, where a package of the extra `train` is missing."""
+    if find_spec(package) is None:
+        raise ModuleNotFoundError(f"this needs {package}, which is in the extra `train`: pip install 'tca_envs[train]'")
 
 
 def new_figure(panels: int, width: float, height: float, **options: Any) -> "tuple[Figure, list[Axes]]":
     """Return a figure of width x height [inch] and its panels, side by side, without touching pyplot's state."""
-    require_matplotlib()
+    require("matplotlib")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from tca_envs import presets
-from tca_envs.mechanics import TCA, Arm, Equilibrium, Gripper, Payload, grasp
+from tca_envs.mechanics import TCA, Equilibrium, Gripper, grasp
 from tca_envs.mechanics.rotation import yaw_angle
 from tca_envs.mechanics.thermal import AMBIENT as COLD
 from tca_envs.mechanics.thermal import SOFT_LIMIT
@@ -81,13 +81,8 @@ class Rig:
         self.scene = np.zeros((1, grasp.SCENE))
         self.scene[0, grasp.Z] = grasp.resting(presets.OBJECT, presets.SITE)
         self.scene[0, grasp.YAW] = np.radians(OBJECT_YAW)
-        self.arms: dict[Payload | None, Arm] = {}
-        self.arm = self._arm(None).equilibrium(self.temperature[:4])
-
-    def _arm(self, payload: Payload | None) -> Arm:
-        if payload not in self.arms:
-            self.arms[payload] = presets.whole_arm(self.law, payload)
-        return self.arms[payload]
+        self.model = presets.whole_arm(law)
+        self.arm = self.model.equilibrium(self.temperature[:4])
 
     def move(self, bending: float = COLD, helix: float = COLD, jaws: float = COLD, lowered: float = 0.0) -> None:
         """Heat the TCA at +x, the helical one and the gripper's [degC], then move the stage by `lowered` [m], in substeps."""
@@ -98,7 +93,7 @@ class Rig:
             self.temperature = self.temperature + change if heating else self.temperature
             held = self.scene[0, grasp.HELD] > 0.5
             payload = presets.with_object(grasp.in_mount(self.scene[0], self.arm.tip_pose)) if held else None
-            arm = self._arm(payload).equilibrium(self.temperature[:4], start=self.arm)
+            arm = self.model.equilibrium(self.temperature[:4], start=self.arm, payload=payload)
             self.converged &= arm.converged
             self.arm = arm if arm.converged else self.arm
             tool, heading = place(self.arm)
@@ -187,7 +182,7 @@ def ring(gripper: Gripper, gap: float, side: float, points: int = 30) -> Array:
 
 def draw6(sequences: dict[str, list[Frame]], path: Path) -> None:
     """Draw Fig. 6 into a PNG file: a row for each case, a panel for each step."""
-    output.require_matplotlib()
+    output.require("matplotlib")
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 

@@ -7,4 +7,4 @@ from tca_envs.tasks.reach import Reach
 from tca_envs.tasks.task import Task
 from tca_envs.tasks.twist_align import TwistAlign
 
-TASKS: dict[str, Callable[[str], Task]] = {"reach": Reach, "twist-align": TwistAlign, "pick-and-place": PickAndPlace}
+TASKS: dict[str, Callable[[str, float], Task]] = {"reach": Reach, "twist-align": TwistAlign, "pick-and-place": PickAndPlace}

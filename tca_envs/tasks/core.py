@@ -24,7 +24,7 @@ CUT_OFF = HARD_LIMIT - 2.0
 RAMPS = (5, 16)
 """Coarse and fine steps in which `Core.settle` heats."""
 SAME_TIP = 1e-5
-"""Tips within this distance [m] are the same equilibrium."""
+"""Tips within this distance [m], or the arm's tolerance where that is larger, are the same equilibrium."""
 
 
 @dataclass
@@ -196,5 +196,5 @@ class Core:
                 report = self._solve(record, self.heating.ambient + done * (target - self.heating.ambient))
                 good &= solved(report)
             tips.append(record.tip[:, :3, 3])
-        good &= np.linalg.norm(tips[0] - tips[1], axis=1) < SAME_TIP
+        good &= np.linalg.norm(tips[0] - tips[1], axis=1) < max(SAME_TIP, self.arm.discretisation.tolerance or 0.0)
         return record, good

@@ -115,6 +115,7 @@ class PickAndPlace(Task):
     |---|---|---|
     | `reward` | `"sparse"` (`"dense"` in TCAPickAndPlaceDense-v0) | which reward |
     | `split` | `"train"` | where episodes come from: `"train"` or `"held-out"` |
+    | `tolerance` | 1e-5 | largest error of the tip [m], 1e-9 to 1e-3; the cheapest discretisation that keeps to it is chosen |
 
     ## Version History
 
@@ -129,14 +130,14 @@ class PickAndPlace(Task):
         [BOX_CM] * 3 + [1.0] * 5 + [BOX_CM] * 3 + [1.0] * 2,
     )
 
-    def __init__(self, split: str) -> None:
-        super().__init__(split)
+    def __init__(self, split: str, tolerance: float = presets.TOLERANCE) -> None:
+        super().__init__(split, tolerance)
         self.gripper = presets.gripper()
         self._pinch = pinch_table()
 
     def core(self, lanes: int) -> Core:
         """Return `lanes` lanes of the whole arm; the gripper's TCA is heated, too."""
-        return Core(presets.whole_arm(), Heater(), lanes, 4, grasp.SCENE, [self.gripper.rest_length])
+        return Core(presets.whole_arm(tolerance=self.tolerance), Heater(), lanes, 4, grasp.SCENE, [self.gripper.rest_length])
 
     def draw(self, core: Core, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
         """Return targets (count, 4) and scenes (count, SCENE) with the object under the tool of a steady state."""

@@ -78,6 +78,7 @@ class Reach(Task):
     |---|---|---|
     | `reward` | `"sparse"` (`"dense"` in TCAReachDense-v0) | which reward |
     | `split` | `"train"` | where goals come from: `"train"` or `"held-out"` |
+    | `tolerance` | 1e-5 | largest error of the tip [m], 1e-9 to 1e-3; the cheapest discretisation that keeps to it is chosen |
 
     ## Version History
 
@@ -90,7 +91,7 @@ class Reach(Task):
 
     def core(self, lanes: int) -> Core:
         """Return `lanes` lanes of the bending module with the rest of the arm as dead weight."""
-        return Core(presets.bending_arm(), Heater(), lanes, goal_size=3)
+        return Core(presets.bending_arm(tolerance=self.tolerance), Heater(), lanes, goal_size=3)
 
     def draw(self, core: Core, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
         """Return tips (count, 3) [cm] at steady temperatures of this task's split; there is no scene."""

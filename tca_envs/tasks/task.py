@@ -8,6 +8,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from tca_envs import presets
+from tca_envs.mechanics import check
+from tca_envs.mechanics.discretisation import COARSEST, FINEST
 from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT
 from tca_envs.tasks.core import CUT_OFF, Core, Record
 
@@ -28,6 +31,8 @@ class Task(ABC):
     ----------
     split : str
         Where goals come from: "train" or "held-out".
+    tolerance : float
+        Largest error of the arm's tip [m].
     """
 
     actions: ClassVar[int]
@@ -35,10 +40,11 @@ class Task(ABC):
     goal_space: spaces.Box
     observation_space: spaces.Box
 
-    def __init__(self, split: str) -> None:
+    def __init__(self, split: str, tolerance: float = presets.TOLERANCE) -> None:
         if not isinstance(split, str) or split not in SPLITS:
             raise ValueError(f"split = {split!r}: expected one of {', '.join(map(repr, SPLITS))}")
         self.split = split
+        self.tolerance = check.scalar("tolerance", tolerance, FINEST, COARSEST)
 
     @abstractmethod
     def core(self, lanes: int) -> Core:

@@ -88,6 +88,7 @@ class TwistAlign(Task):
     |---|---|---|
     | `reward` | `"sparse"` (`"dense"` in TCATwistAlignDense-v0) | which reward |
     | `split` | `"train"` | where goals come from: `"train"` or `"held-out"` |
+    | `tolerance` | 1e-5 | largest error of the tip [m], 1e-9 to 1e-3; the cheapest discretisation that keeps to it is chosen |
 
     ## Version History
 
@@ -102,7 +103,7 @@ class TwistAlign(Task):
 
     def core(self, lanes: int) -> Core:
         """Return `lanes` lanes of the whole arm."""
-        return Core(presets.whole_arm(), Heater(), lanes, goal_size=5)
+        return Core(presets.whole_arm(tolerance=self.tolerance), Heater(), lanes, goal_size=5)
 
     def draw(self, core: Core, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
         """Return tip positions [cm] and yaws (count, 5) at steady temperatures of this task's split; there is no scene."""

@@ -1,0 +1,261 @@
+"""The discretisation that follows from a tolerance and a scene, and the closed form that needs none."""
+
+import time
+from dataclasses import replace
+from itertools import product
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import tca_envs  # noqa: F401
+from tca_envs import presets
+from tca_envs.mechanics import TCA, Arm, Grid, Module, Muscle, Payload, Spring, Tendon, discretisation, discretise
+from tca_envs.mechanics.arm import default_grid, interpolation
+from tca_envs.mechanics.thermal import AMBIENT
+from tca_envs.tasks.core import CUT_OFF
+
+TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-8)
+ARMS = {"bending": presets.bending_arm, "whole": presets.whole_arm}
+
+
+def finer(arm: Arm) -> Arm:
+    """The arm on a grid whose error is next to nothing, below 1e-11 m on the presets."""
+    grids = [Grid(2 * default_grid(module).elements, 10) for module in arm.modules]
+    return Arm(arm.modules, arm.gravity, arm.payload, grids, residual_tolerance=1e-11)
+
+
+def tip_errors(arm: Arm, drives: np.ndarray, payloads: tuple[Payload | None, ...] = (None,)) -> np.ndarray:
+    """Distance [m] to the equilibrium on a fine grid, on the branch that the arm is on, after a warm step of some degrees."""
+    fine, errors = finer(arm), []
+    for i, drive in enumerate(drives):
+        payload = payloads[i % len(payloads)]
+        before = arm.equilibrium(np.clip(drive + 8.0 * (-1.0) ** i, AMBIENT, CUT_OFF), payload=payload)
+        here = arm.equilibrium(drive, start=before, payload=payload)
+        there = fine.equilibrium(drive, start=here, payload=payload)
+        assert there.converged
+        errors.append(np.linalg.norm(here.tip_pose[:3, 3] - there.tip_pose[:3, 3]) if here.converged else np.inf)
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("tolerance", TOLERANCES)
+@pytest.mark.parametrize("name", ARMS)
+def test_the_tip_stays_within_the_tolerance(name, tolerance):
+    """At random temperatures, none of those that decided; the study `tolerance` does this with 2,000 for each task."""
+    arm = ARMS[name](tolerance=tolerance)
+    drives = np.random.default_rng(7).uniform(AMBIENT, CUT_OFF, (60, len(arm.muscles)))
+    errors = tip_errors(arm, drives, (None, presets.with_object()) if name == "whole" else (None,))
+    assert (errors <= tolerance).all()
+    assert np.median(errors) > 1e-4 * tolerance  # and nothing is wasted
+    assert arm.discretisation.error <= tolerance == arm.discretisation.tolerance
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_a_looser_tolerance_is_cheaper(name):
+    arms = [ARMS[name](tolerance=tolerance) for tolerance in TOLERANCES]
+    costs = [
+        sum(discretisation.cost(module, grid) for module, grid in zip(arm.modules, arm.grids, strict=True)) for arm in arms
+    ]
+    assert costs == sorted(costs) and len(set(costs)) == len(costs)
+    stops = [arm.residual_tolerance for arm in arms]
+    assert stops == sorted(stops, reverse=True)
+
+
+def test_no_grid_that_keeps_to_the_tolerance_is_cheaper():
+    """For the bending arm all cheaper ones can be tried: each errs by more than the tolerance over the safety factor."""
+    tolerance = 1e-5
+    arm = presets.bending_arm(tolerance=tolerance)
+    (chosen,), (module,) = arm.grids, arm.modules
+    drives = np.array([*product((25.0, 160.0), repeat=3), *np.random.default_rng(0).uniform(25.0, 160.0, (60, 3))])
+    cheaper = [Grid(e, q) for e in (1, 2, 3) for q in range(3, 9)]
+    cheaper = [grid for grid in cheaper if discretisation.cost(module, grid) < discretisation.cost(module, chosen)]
+    assert Grid(1, 5) in cheaper
+    for grid in cheaper:
+        coarse = Arm(arm.modules, arm.gravity, arm.payload, [grid], arm.residual_tolerance)
+        assert tip_errors(coarse, drives).max() > tolerance / discretisation.SAFETY
+
+
+def test_the_choice_is_the_same_every_time():
+    module = presets.bending_module()
+    arm = Arm([module], presets.GRAVITY, presets.BELOW_BENDING)
+    drives = np.random.default_rng(0).uniform(25.0, 160.0, (40, 3))
+    first, second = (discretise(arm, 1e-5, drives).discretisation for _ in range(2))
+    assert first == second and first.states == 40
+
+
+@pytest.mark.parametrize("tolerance", TOLERANCES)
+def test_the_choice_takes_less_than_a_fifth_of_a_second(tolerance):
+    presets.whole_arm()  # compiled
+    taken = []
+    for _ in range(3):
+        presets._scene.cache_clear()
+        begun = time.process_time()
+        presets.whole_arm(tolerance=tolerance)
+        taken.append(time.process_time() - begun)
+    assert min(taken) < 0.2
+
+
+def test_the_environment_says_what_was_chosen():
+    env = gym.make("TCATwistAlign-v0", tolerance=1e-4)
+    lines = str(env.unwrapped.arm.discretisation).splitlines()
+    (e0, q0), (e1, q1) = env.unwrapped.arm.grids
+    assert lines[0] == f"module 0: {e0} x {q0} Gauss nodes" and lines[1] == f"module 1: {e1} x {q1} Gauss nodes"
+    error = env.unwrapped.arm.discretisation.error
+    assert lines[-1] == f"tip error: {error:.1e} m estimated from {presets.STATES} states, 1.0e-04 m asked"
+    assert "not estimated" in str(Arm([presets.bending_module()]).discretisation)
+
+
+def test_few_hard_states_among_many_easy_ones_decide():
+    """All TCAs equally hot stretch and shorten the module, which any grid resolves; one state of bending is enough."""
+    arm = Arm([presets.bending_module()], presets.GRAVITY, presets.BELOW_BENDING)
+    easy, hard = np.repeat(np.linspace(30.0, 150.0, 60), 3).reshape(-1, 3), np.array([[144.0, 64.0, 78.0]])
+    chosen = discretise(arm, 1e-4, np.vstack([easy, hard]))
+    assert tip_errors(chosen, hard).max() <= 1e-4
+    assert discretise(arm, 1e-4, easy).grids != chosen.grids
+
+
+def test_states_without_equilibrium_do_not_decide():
+    """A rod that is pushed far beyond buckling under a twisting payload may have none in reach; the other states decide."""
+    arm = Arm([presets.bending_module()], presets.GRAVITY, presets.BELOW_BENDING)
+    drives = np.random.default_rng(0).uniform(25.0, 160.0, (20, 3))
+    loads = np.tile(arm.load(), (21, 1))
+    loads[20, 3:6] = 1e6  # a moment that no rod bears
+    plain = discretise(arm, 1e-5, drives)
+    other = discretise(arm, 1e-5, np.vstack([drives, drives[:1]]), loads)
+    assert other.grids == plain.grids
+    with pytest.raises(ValueError, match=r"drives = .* at least one has an equilibrium"):
+        discretise(arm, 1e-5, drives[:1], loads[20:])
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -1e-5, 9e-10, 2e-3, np.nan, np.inf, None, "1e-5", True])
+def test_a_tolerance_out_of_range_is_refused(tolerance):
+    arm = Arm([presets.bending_module()])
+    with pytest.raises(ValueError, match=r"tolerance = .*: expected a finite number in \[1e-09, 0.001\]"):
+        discretise(arm, tolerance, [[25.0, 25.0, 25.0]])
+
+
+@pytest.mark.parametrize(
+    ("drives", "loads", "name"),
+    [
+        ([[25.0, 25.0]], None, "drives"),
+        ([], None, "drives"),
+        (np.empty((0, 3)), None, "drives"),
+        ([[25.0, 25.0, 400.0]], None, "drive"),
+        ([[25.0, 25.0, np.nan]], None, "drives"),
+        ([[25.0, 25.0, 25.0]], np.zeros((2, 13)), "loads"),
+        ([[25.0, 25.0, 25.0]], np.zeros((1, 12)), "loads"),
+    ],
+)
+def test_states_of_the_wrong_kind_are_refused(drives, loads, name):
+    arm = Arm([presets.bending_module()], presets.GRAVITY)
+    with pytest.raises(ValueError, match=name):
+        discretise(arm, 1e-5, drives, loads)
+
+
+def test_interpolation_between_grids_is_exact_for_polynomials():
+    here, there = Grid(2, 4), Grid(3, 5)
+    x, y = (((np.arange(e)[:, None] + 0.5 + 0.5 * np.polynomial.legendre.leggauss(q)[0]) / e).ravel() for e, q in (here, there))
+    values = np.column_stack([x**3 - x, np.ones_like(x)])
+    expected = np.column_stack([y**3 - y, np.ones_like(y)])
+    np.testing.assert_allclose(interpolation(here, there) @ values, expected, atol=1e-14)
+
+
+# Without load: the closed form.
+
+TWISTED = Muscle(3.5e-3, 0.4, 5.0, TCA())
+
+
+def module(*muscles: Muscle, **changes: object) -> Module:
+    """A module of the bending module's section."""
+    made = Module.cylinder(0.02, 4.5e-3, 0.125e6, 0.125e6 / 3, 0.0, muscles)
+    return replace(made, **changes)
+
+
+UNLOADED = {
+    "straight": ([module(Muscle(4e-3, 0.0, 0.0, TCA()), Muscle(4e-3, 2.0, 0.0, TCA()))], [130.0, 60.0]),
+    "helix": ([module(TWISTED)], [140.0]),
+    "two helices and an axial muscle": (
+        [module(TWISTED, Muscle(2e-3, 2.0, 5.0, Spring(20.0)), Muscle(0.0, 0.0, 0.0, Tendon()))],
+        [100.0, 0.1, 0.1],
+    ),
+    "precurved": (
+        [module(Muscle(2e-3, 1.0, 0.0, TCA()), reference_strain=np.array([10.0, 20.0, 5.0, 0.0, 0.1, 1.0]))],
+        [120.0],
+    ),
+    "no muscle": ([module()], []),
+    "in series": ([presets.bending_module(), presets.twisting_module()], [120.0, 40.0, 30.0, 110.0]),
+}
+
+
+@pytest.mark.parametrize("case", UNLOADED)
+def test_the_closed_form_is_the_equilibrium_that_collocation_finds(case):
+    modules, drive = UNLOADED[case]
+    arm = Arm(modules)
+    found = arm.equilibrium(drive)
+    assert found.message.startswith("closed form") and found.residual < 1e-9
+    # A push too small to matter makes collocation do it.
+    fine = Arm(modules, grids=[Grid(12, 8)] * len(modules), residual_tolerance=1e-11)
+    integrated = fine.equilibrium(drive, tip_force=(1e-15, 0.0, 0.0))
+    assert not integrated.message.startswith("closed form")
+    np.testing.assert_allclose(found.tip_pose, integrated.tip_pose, atol=1e-10)
+    np.testing.assert_allclose(found.tensions, integrated.tensions, atol=1e-9)
+    np.testing.assert_allclose(found.muscle_lengths, integrated.muscle_lengths, atol=1e-11)
+    s = np.linspace(0.0, arm.length, 9)
+    np.testing.assert_allclose(found.strain(s), integrated.strain(s), atol=1e-5, rtol=1e-5)
+
+
+def test_the_closed_form_warm_starts_and_is_warm_started():
+    modules, drive = UNLOADED["in series"]
+    arm = Arm(modules)
+    cold = arm.equilibrium(drive)
+    near = arm.equilibrium(np.add(drive, 2.0), start=cold)
+    assert near.converged and near.iterations < arm.equilibrium(np.add(drive, 2.0)).iterations
+    assert arm.equilibrium(drive, start=cold).iterations == 0
+    pushed = arm.equilibrium(drive, tip_force=(1e-3, 0.0, 0.0), start=cold)
+    back = arm.equilibrium(drive, start=pushed)
+    np.testing.assert_allclose(back.tip_pose, cold.tip_pose, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"gravity": (0.0, 0.0, 9.81), "payload": Payload(1e-3)},
+        {"tip_force": (0.0, 0.0, 1e-3)},
+        {"tip_moment": (0.0, 1e-6, 0.0)},
+        {"modules": [module(TWISTED, Muscle(3e-3, 0.0, 2.0, TCA()))], "drive": [60.0, 60.0]},
+        {"modules": [module(TWISTED, stiffness=np.array([2e-6, 3e-6, 2e-6, 1.0, 1.0, 2.0]))], "drive": [60.0]},
+        {"modules": [module(TWISTED, reference_strain=np.array([10.0, 0.0, 0.0, 0.0, 0.0, 1.0]))], "drive": [60.0]},
+    ],
+)
+def test_what_loads_the_arm_or_makes_its_strain_vary_is_integrated(changes):
+    modules, drive = changes.get("modules", [module(TWISTED)]), changes.get("drive", [60.0])
+    arm = Arm(modules, changes.get("gravity", (0.0, 0.0, 0.0)), changes.get("payload"))
+    loads = {name: changes[name] for name in ("tip_force", "tip_moment") if name in changes}
+    found = arm.equilibrium(drive, **loads)
+    assert found.converged and not found.message.startswith("closed form")
+
+
+def test_weight_without_gravity_and_gravity_without_weight_load_nothing():
+    for arm in (
+        Arm([module(TWISTED)], payload=Payload(1e-3)),
+        Arm([replace(module(TWISTED), mass_per_length=0.1)]),
+        Arm([module(TWISTED)], (0.0, 0.0, 9.81)),
+    ):
+        assert arm.equilibrium([60.0]).message.startswith("closed form")
+
+
+def test_a_scene_without_load_needs_no_grid():
+    arm = Arm([module(TWISTED)])
+    chosen = discretise(arm, 1e-6, [[60.0], [150.0]])
+    assert chosen.grids == arm.grids and chosen.discretisation.error == 0.0
+
+
+def test_a_small_change_moves_the_arm_even_at_a_loose_tolerance():
+    """Not in jerks: by the first-order answer."""
+    arm = presets.bending_arm(tolerance=1e-3)
+    here = arm.equilibrium([100.0, 60.0, 40.0])
+    there = arm.equilibrium([100.01, 60.0, 40.0], start=here)
+    moved = there.tip_pose[:3, 3] - here.tip_pose[:3, 3]
+    again = arm.equilibrium([100.02, 60.0, 40.0], start=there).tip_pose[:3, 3] - there.tip_pose[:3, 3]
+    np.testing.assert_allclose(again, 0.01 * there.tip_jacobian[:3, 0], rtol=0.02, atol=1e-9)
+    assert np.linalg.norm(moved) > 1e-7
