@@ -211,6 +211,24 @@ def test_the_budget_ends_a_point_and_patience_a_method(bending):
     assert second.cases == 0 and second.note.startswith("not run")
 
 
+def test_what_builds_slowly_is_left_out_when_there_is_no_time(bending):
+    built = []
+
+    def build(arm, setting, states):
+        built.append(setting)
+        time.sleep(0.02)
+        return collocation.Collocation(arm)
+
+    method = Method("fake", "knob", (1, 2, 3), build, builds_slowly=True)
+    for building, settings in ((0.0, []), (0.03, [1, 2]), (np.inf, [1, 2, 3])):
+        built.clear()
+        found = timing.points(bending, method, Referee(bending), BRIEF._replace(building=building), lambda: None)
+        assert built == settings and [p.solved for p in found] == [s in settings for s in (1, 2, 3)]
+        assert all(p.note.startswith("not run") for p in found if not p.solved)
+    quickly = replace(method, builds_slowly=False)
+    assert all(p.solved for p in timing.points(bending, quickly, Referee(bending), BRIEF._replace(building=0.0), lambda: None))
+
+
 def test_the_error_against_the_finest_setting(bending):
     def build(arm, setting, states):
         return Fake(collocation.Collocation(arm), moved(setting))

@@ -81,5 +81,7 @@ class Method:
     """Whether it solves a simpler model: then its error does not vanish, and a far answer is no failure."""
     own_limit: bool = False
     """Whether it solves another law of its own: then its error is also that against its own finest setting."""
+    builds_slowly: bool = False
+    """Whether `build` compiles for half a minute or more at each setting."""
     available: Callable[[], bool] = lambda: True
     """Whether the package that it needs is installed."""

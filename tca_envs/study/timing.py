@@ -25,7 +25,7 @@ SMALLEST_ERROR = 1e-13
 """Errors below this are raised to it [m]: a few units in the last place of the tip's coordinates."""
 
 FAILS, REFUSES = "fails on all cases", "cannot model this arm"
-NOT_INSTALLED, NOT_RUN = "not installed", "not run: the coarser settings took too long"
+NOT_INSTALLED, NOT_RUN = "not installed", "not run: it would take too long"
 """Notes of points that have nothing to show."""
 
 
@@ -40,10 +40,12 @@ class Effort(NamedTuple):
     """... unless it has fewer than this."""
     patience: float
     """Time [s] that a method has on a scene; then its finer settings are left out."""
+    building: float = np.inf
+    """Time [s] that its solvers may take to build on a scene, likewise; with none, methods that build slowly are left out."""
 
 
-FULL = Effort(cases=100, budget=2.0, least=3, patience=30.0)
-QUICK = Effort(cases=12, budget=0.1, least=1, patience=0.6)
+FULL = Effort(cases=100, budget=2.0, least=3, patience=30.0, building=120.0)
+QUICK = Effort(cases=12, budget=0.1, least=1, patience=0.6, building=0.0)
 
 
 class Known(NamedTuple):
@@ -251,20 +253,22 @@ def points(scene: Scene, method: Method, referee: Referee, effort: Effort, done:
     farthest = np.inf if method.reduced else OTHER_EQUILIBRIUM * scene.arm.length
     result: list[Point] = []
     tips: list[Array] = []
-    spent, compiled = 0.0, False
+    spent, building, compiled = 0.0, 0.0, False
     for setting in method.settings:
         blank = Point(scene.name, method.name, method.knob, label(setting), scene.start)
         measured = Measured(np.empty(0), np.empty((0, 3)), np.empty(0), 0.0)
         if not method.available():
             point = blank._replace(note=NOT_INSTALLED)
-        elif spent > effort.patience:
+        elif spent > effort.patience or (method.builds_slowly and building >= effort.building):
             point = blank._replace(note=NOT_RUN)
         else:
+            begun = time.perf_counter()
             try:
                 solver = method.build(scene.arm, setting, states)
             except ValueError as error:
                 point = blank._replace(note=f"{REFUSES}: {error}")
             else:
+                building += time.perf_counter() - begun
                 if not compiled:
                     timed(solver, scene.cases[order[0]], referee(order[0]))
                     compiled = True

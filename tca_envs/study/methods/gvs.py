@@ -362,7 +362,8 @@ def elongation(kind: NDArray[np.int64], parameters: Array, rest: Array, tension:
 METHOD = Method(
     "geometric variable strain (SoRoMoX)",
     "order",
-    (0, 1, 2, 3, 4, 5),
+    (1, 3, 5),
     build,
+    builds_slowly=True,
     available=lambda: find_spec("soromox") is not None,
 )
