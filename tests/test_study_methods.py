@@ -14,10 +14,17 @@ from tca_envs.study.methods import METHODS, ablation, bvp, paper, strain_basis
 CURVATURE, PIECES, POLYNOMIALS, KIRCHHOFF = strain_basis.METHODS
 FULL = (PIECES, POLYNOMIALS, bvp.METHOD, *paper.METHODS)
 ALL = (*strain_basis.METHODS, bvp.METHOD, *paper.METHODS, *ablation.METHODS)
+SLOW = (*strain_basis.METHODS, paper.METHODS[1])
+compiled = pytest.mark.slow
+"""Of what needs the kernels of strain bases, which take a minute to compile and serve the charts alone."""
 
 E, RADIUS, LENGTH = 0.125e6, 0.0045, 0.045
 BENT = np.array([100.0, 60.0, 25.0])
 WHOLE = np.array([100.0, 60.0, 25.0, 80.0])
+
+
+def some(*methods):
+    return [pytest.param(method, marks=compiled) if method in SLOW else method for method in methods]
 
 
 def name(method):
@@ -59,7 +66,7 @@ def warm(method, setting, make, drive, step=3.0, tip_force=(0.0, 0.0, 0.0)):
 @pytest.mark.parametrize(
     ("tension", "tip"), [(0.3, (0.0249404116, 0.0, 0.0314365278)), (1.2, (0.0027944622, 0.0, -0.0056561498))]
 )
-@pytest.mark.parametrize("method", (CURVATURE, PIECES, POLYNOMIALS, bvp.METHOD, paper.METHODS[1]), ids=name)
+@pytest.mark.parametrize("method", some(CURVATURE, PIECES, POLYNOMIALS, bvp.METHOD, paper.METHODS[1]), ids=name)
 def test_a_straight_tendon_bends_a_rod_to_an_arc(method, tension, tip):
     state = State(rod([Tendon()]), np.array([tension]))
     solver = method.build(state.arm, method.settings[2 if method.knob in ("rtol", "tol") else 0], [state])
@@ -69,7 +76,7 @@ def test_a_straight_tendon_bends_a_rod_to_an_arc(method, tension, tip):
     np.testing.assert_allclose(answer.tip[:3, 3], tip, rtol=0.0, atol=2e-5 if coarse else 2e-9)
 
 
-@pytest.mark.parametrize("method", (CURVATURE, PIECES, bvp.METHOD), ids=name)
+@pytest.mark.parametrize("method", some(CURVATURE, PIECES, bvp.METHOD), ids=name)
 def test_springs_share_the_tension(method):
     state = State(rod([Spring(50.0)] * 3), np.array([0.042, 0.033, 0.033]))
     solver = method.build(state.arm, method.settings[-1], [state])
@@ -78,7 +85,7 @@ def test_springs_share_the_tension(method):
     assert np.arccos((np.trace(answer.tip[:3, :3]) - 1.0) / 2.0) == pytest.approx(0.859345402, abs=1e-6)
 
 
-@pytest.mark.parametrize("method", (PIECES, bvp.METHOD), ids=name)
+@pytest.mark.parametrize("method", some(PIECES, bvp.METHOD), ids=name)
 def test_gravity_and_payload_bend_a_rod_that_lies(method):
     """Small loads: a Timoshenko beam's tip under its payload's weight sinks by P L^3/3EI + P L/GA."""
     arm = Arm(rod([Tendon()]).modules, (1e-4, 0.0, 0.0), Payload(1.0))
@@ -90,6 +97,7 @@ def test_gravity_and_payload_bend_a_rod_that_lies(method):
 # Against the full model.
 
 
+@compiled
 def test_error_of_constant_pieces_falls_with_their_number_squared():
     errors = [warm(PIECES, pieces, presets.bending_arm, BENT) for pieces in PIECES.settings[1:]]
     ratios = np.divide(errors[:-1], errors[1:])
@@ -97,11 +105,13 @@ def test_error_of_constant_pieces_falls_with_their_number_squared():
     assert errors[-1] < 1.2e-5
 
 
+@compiled
 def test_polynomials_converge_exponentially():
     errors = [warm(POLYNOMIALS, order, presets.bending_arm, BENT) for order in POLYNOMIALS.settings]
     assert errors[0] > 1e-3 and errors[3] < 2e-6 and errors[4] < 5e-8
 
 
+@compiled
 def test_polynomials_bend_out_of_plane():
     """Curvature that turns: rotations do not commute along the module."""
     arm, drive, force = fine(presets.bending_arm), np.array([150.0, 60.0, 25.0]), (0.0, 0.02, 0.0)
@@ -111,7 +121,14 @@ def test_polynomials_bend_out_of_plane():
     assert error(basis.solve(state, basis.near(known, state)), known) < 2e-7
 
 
-@pytest.mark.parametrize(("method", "setting", "limit"), [(PIECES, 16, 1e-5), (POLYNOMIALS, 4, 1e-5), (bvp.METHOD, 1e-4, 1e-7)])
+@pytest.mark.parametrize(
+    ("method", "setting", "limit"),
+    [
+        pytest.param(PIECES, 16, 1e-5, marks=compiled),
+        pytest.param(POLYNOMIALS, 4, 1e-5, marks=compiled),
+        (bvp.METHOD, 1e-4, 1e-7),
+    ],
+)
 def test_both_modules(method, setting, limit):
     assert warm(method, setting, presets.whole_arm, WHOLE, tip_force=(0.0, 1e-3, 0.0)) < limit
 
@@ -121,12 +138,13 @@ def test_boundary_value_problem_meets_its_tolerance():
     assert errors[0] < 1e-5 and errors[2] < 1e-7 and errors[3] < 5e-9
 
 
-@pytest.mark.parametrize("method", paper.METHODS, ids=name)
+@pytest.mark.parametrize("method", some(*paper.METHODS), ids=name)
 def test_shooting_goes_on_from_its_last_answer(method):
     assert warm(method, 1e-2, presets.bending_arm, BENT) < 5e-4
     assert warm(method, 1e-4, presets.bending_arm, BENT) < 2e-6
 
 
+@compiled
 def test_shooting_takes_a_good_start():
     """Where the straight arm is none: the plain method spends its evaluations there."""
     arm = fine(presets.bending_arm)
@@ -137,6 +155,7 @@ def test_shooting_takes_a_good_start():
     assert answer.guess.iterations < 30
 
 
+@compiled
 def test_kirchhoff_rods_neither_shear_nor_stretch():
     arm = fine(presets.bending_arm)
     stiff = effects.without_extension(effects.without_shear(arm))
@@ -147,6 +166,7 @@ def test_kirchhoff_rods_neither_shear_nor_stretch():
     assert error(answer, arm.equilibrium(BENT, state.tip_force)) > 5e-4
 
 
+@compiled
 def test_constant_curvature_does_not_twist():
     arm = fine(presets.whole_arm)
     state = State(arm, np.array([25.0, 25.0, 25.0, 120.0]))
@@ -157,7 +177,7 @@ def test_constant_curvature_does_not_twist():
     assert (answer.guess.q.shape == (2, 3)) and (arm.equilibrium(state.drive).tip_pose[0, 0] < 0.0)
 
 
-@pytest.mark.parametrize("method", [method for method in METHODS[1:] if method.available()], ids=name)
+@pytest.mark.parametrize("method", some(*(method for method in METHODS[1:] if method.available())), ids=name)
 def test_a_known_equilibrium_is_a_start(method):
     arm = fine(presets.bending_arm)
     known = arm.equilibrium(BENT)
@@ -167,6 +187,7 @@ def test_a_known_equilibrium_is_a_start(method):
     assert error(answer, known) < (2e-2 if method.reduced else 5e-4)
 
 
+@compiled
 def test_starts_are_near_the_answer():
     arm = fine(presets.whole_arm)
     known = arm.equilibrium(WHOLE)
@@ -190,6 +211,7 @@ def test_starts_are_near_the_answer():
 # Work inside.
 
 
+@compiled
 @pytest.mark.parametrize(("pieces", "order"), [(1, 4), (8, 0), (3, 2)])
 def test_newton_has_the_tangent_of_the_reduced_equations(pieces, order):
     arm = presets.whole_arm()
@@ -227,7 +249,7 @@ def test_boundary_value_problem_has_its_derivatives():
         np.testing.assert_allclose(found, by_pull[:, i], atol=1e-6)
 
 
-@pytest.mark.parametrize("method", ALL, ids=name)
+@pytest.mark.parametrize("method", some(*ALL), ids=name)
 @pytest.mark.parametrize(
     ("drive", "tip_force"),
     [([158.0] * 3, (0.0, 0.0, 0.0)), ([25.0, 158.0, 25.0], (1.2, 0.0, 0.0)), ([25.0] * 3, (0.0, 0.2, -1.2))],
@@ -298,30 +320,3 @@ def test_stiffened_rods():
     np.testing.assert_allclose(sheared[:, 5], 1.0, atol=1e-6)
     np.testing.assert_allclose(stretched[:, 3:5], 0.0, atol=1e-6)
     assert np.abs(sheared[:, 3:5]).max() > 1e-3 and np.abs(stretched[:, 5] - 1.0).max() > 1e-3
-
-
-def test_uncoupled_modules_hold_what_is_beyond():
-    arm = presets.whole_arm()
-    first, second = effects.uncoupled(arm)
-    assert second.payload == arm.payload
-    assert first.payload.mass == pytest.approx(presets.TWISTING_MASS + presets.GRIPPER_MASS)
-    beyond = presets.TWISTING_LENGTH + presets.GRIPPER_CENTRE[2]
-    centre = (presets.TWISTING_MASS * presets.TWISTING_LENGTH / 2.0 + presets.GRIPPER_MASS * beyond) / first.payload.mass
-    assert first.payload.centre == pytest.approx((0.0, 0.0, centre), abs=1e-12)
-    # Without weight nothing couples them.
-    free = effects.without_gravity(arm)
-    state = State(free, WHOLE)
-    known = free.equilibrium(WHOLE)
-    np.testing.assert_allclose(effects.LEFT_OUT["module coupling"](free, state, known), known.tip_pose, atol=1e-5)
-
-
-def test_every_effect_is_worth_something():
-    arm = fine(presets.whole_arm)
-    state = State(arm, WHOLE, payload=Payload(2e-3))
-    known = arm.equilibrium(WHOLE, payload=state.payload)
-    worth = {
-        effect: np.linalg.norm(tip(arm, state, known)[:3, 3] - known.tip_pose[:3, 3])
-        for effect, tip in effects.LEFT_OUT.items()
-    }
-    assert all(1e-5 < value < 0.06 for value in worth.values()), worth
-    assert worth["gravity"] > worth["passive muscles"] > worth["shear"]
