@@ -285,7 +285,8 @@ def test_active_muscles_pull_by_themselves():
 
 def test_passive_muscles_are_taken_out():
     arm = presets.bending_arm()
-    other, kept = effects.without_passive(arm, np.array([25.0, 90.0, 25.0]))
+    kept = effects.active(arm, np.array([25.0, 90.0, 25.0]))
+    other = effects.with_muscles(arm, kept)
     assert kept.tolist() == [False, True, False] and other.muscles == (arm.muscles[1],)
     state, next_state = State(arm, np.array([25.0, 90.0, 25.0])), State(arm, np.array([25.0, 90.0, 80.0]))
     solver = ablation.driven(arm, "default", [state])
@@ -295,7 +296,7 @@ def test_passive_muscles_are_taken_out():
     whole = effects.extended(arm, first.guess.found, kept)
     assert whole.tensions[kept] == first.guess.found.tensions and not whole.tensions[~kept].any()
     assert whole.known[0].tolist() == [25.0, 90.0, 25.0]
-    two, _ = effects.without_passive(arm, next_state.drive)
+    two = effects.with_muscles(arm, effects.active(arm, next_state.drive))
     assert error(solver.solve(next_state, first.guess), two.equilibrium([90.0, 80.0])) < 1e-6
     none = State(arm, np.full(3, 25.0))
     assert error(solver.solve(none, first.guess), effects.with_muscles(arm, np.zeros(3, dtype=bool)).equilibrium([])) < 1e-6

@@ -60,12 +60,6 @@ def with_muscles(arm: Arm, kept: NDArray[np.bool_]) -> Arm:
     return _rebuilt(arm, modules)
 
 
-def without_passive(arm: Arm, drive: Array) -> tuple[Arm, NDArray[np.bool_]]:
-    """Return the arm without the muscles that do not pull by themselves at a drive (n,), and which are kept (n,)."""
-    kept = active(arm, drive)
-    return with_muscles(arm, kept), kept
-
-
 def restricted(known: Equilibrium, kept: NDArray[np.bool_]) -> Equilibrium:
     """Return a start for the arm `with_muscles(arm, kept)` from an equilibrium of the whole one."""
     drive, load = known.known
