@@ -1,5 +1,6 @@
 """What the README shows works."""
 
+import csv
 import json
 import re
 import subprocess
@@ -9,14 +10,21 @@ from pathlib import Path
 import pytest
 
 from agents.scripted import CONTROLLERS
+from tca_envs.study import size
+from tca_envs.study.scenes import SCENES
+from tca_envs.study.speed_accuracy import OURS, beaten, ratio, spread
+from tca_envs.study.timing import Point
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.S)
 
+BEATEN_BY: list[tuple[str, str, str]] = []
+"""Scene, method and setting of points on the charts that are both faster and more accurate than one of this package's."""
+
 
 def test_there_are_examples():
-    assert len(EXAMPLES) == 3
+    assert len(EXAMPLES) == 4
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
@@ -74,3 +82,73 @@ def test_results_are_those_of_the_reports(report):
             f"| {'--' if time is None else f'{time:.2f} s'} | {result['energy_J']:.1f} J |"
         )
         assert row in README, row
+
+
+def test_the_table_of_tolerances_is_that_of_the_study():
+    with (ROOT / "docs/study/tolerance.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    tasks = list(dict.fromkeys(row["task"] for row in rows))
+    by_key = {(row["task"], float(row["tolerance_m"])): row for row in rows}
+    for tolerance in sorted({key[1] for key in by_key}, reverse=True):
+        cells = []
+        for task in tasks:
+            row = by_key[task, tolerance]
+            ratio = float(row["solve_s"]) / float(by_key[task, 1e-6]["solve_s"])
+            cells.append(f"{row['grids'].replace(' x ', ' × ')}; {ratio:.2f}")
+        line = f"| {tolerance:.0e} m | " + " | ".join(cells) + " |"
+        assert line in README, line
+    least = min(float(row["share_within"]) for row in rows)
+    assert f"in {100.0 * least:.2f} % or more of 2,000 random states" in README
+    assert {row["states"] for row in rows} == {"2000"}
+
+
+def measured():
+    """All points of the two runs of the speed-accuracy study, warm and cold."""
+    points = []
+    for folder in ("docs/study", "docs/study/harder"):
+        with (ROOT / folder / "speed_accuracy.csv").open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                cases, rate = int(row["cases"]), float(row["failure_rate"])
+                failed = round(rate * cases) if cases else 0
+                time, error = float(row["median_time_s"]), float(row["median_error_m"])
+                point = Point(row["scene"], row["method"], row["knob"], row["setting"], row["start"], cases, failed, time)
+                points.append(point._replace(error=error))
+    return points
+
+
+def test_exponents_of_size_are_those_of_the_study():
+    with (ROOT / "docs/study/size.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for sweep, column in ((size.MODULES, "modules"), (size.MUSCLES, "muscles_of_a_module"), (size.LANES, "lanes")):
+        mine = [row for row in rows if row["varied"] == sweep.name]
+        assert tuple(int(row[column]) for row in mine) == sweep.values
+        exponent, _ = sweep._replace(seconds=tuple(float(row["median_time_s"]) for row in mine)).fit
+        assert f"{sweep.name}^{exponent:.2f}" in README
+
+
+def test_the_chart_covers_all_scenes():
+    assert {point.scene for point in measured()} == set(SCENES)
+
+
+@pytest.mark.parametrize("method", ["the paper's shooting", "boundary value problem (SciPy solve_bvp)"])
+def test_ratios_are_those_of_the_chart(method):
+    """Of warm solves at equal or better accuracy, over all scenes."""
+    points = [point for point in measured() if point.start == "warm"]
+    ratios = []
+    for scene in SCENES:
+        ours = [point for point in points if point.scene == scene and point.method == OURS]
+        theirs = [point for point in points if point.scene == scene and point.method == method and point.solved]
+        ratios += [value for value in (ratio(ours, point) for point in theirs) if value > 0.0]
+    assert f"{spread(min(ratios), max(ratios))} times" in README, spread(min(ratios), max(ratios))
+    if method == "the paper's shooting":
+        assert min(ratios) > 1000.0
+
+
+def test_who_beats_this_package_is_said():
+    points = measured()
+    winners = set()
+    for scene in SCENES:
+        ours = [point for point in points if point.scene == scene and point.method == OURS]
+        theirs = [point for point in points if point.scene == scene and point.method != OURS]
+        winners |= {(scene, point.method, point.setting) for point, _ in beaten(ours, theirs)}
+    assert sorted(winners) == sorted(BEATEN_BY)
