@@ -84,15 +84,21 @@ def test_the_choice_is_the_same_every_time():
 
 
 @pytest.mark.parametrize("tolerance", TOLERANCES)
-def test_the_choice_takes_less_than_a_fifth_of_a_second(tolerance):
-    presets.whole_arm()  # compiled
-    taken = []
-    for _ in range(3):
+def test_the_choice_takes_less_time_than_two_thousand_solves(tolerance):
+    """A fifth of a second where a warm solve of the whole arm takes 100 us: other work on the machine slows both."""
+    arm = presets.whole_arm(tolerance=1e-6)
+    states = [arm.equilibrium(np.full(4, temperature)) for temperature in (80.0, 81.0)]
+    chosen, solved = [], []
+    for _ in range(4):
         presets._scene.cache_clear()
         begun = time.process_time()
         presets.whole_arm(tolerance=tolerance)
-        taken.append(time.process_time() - begun)
-    assert min(taken) < 0.2
+        chosen.append(time.process_time() - begun)
+        begun = time.process_time()
+        for i in range(1000):
+            arm.equilibrium(states[i % 2].drive, start=states[1 - i % 2])
+        solved.append(time.process_time() - begun)
+    assert min(chosen) < 2.0 * min(solved)
 
 
 def test_the_environment_says_what_was_chosen():
