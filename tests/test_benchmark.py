@@ -121,6 +121,9 @@ def test_the_counted_cost_of_a_grid_follows_the_measured_time():
             assert (report[:, 2] == 2).all()
     measured, counted = taken.min(axis=0), np.array([cost(module, grid) for grid in grids])
     assert spearmanr(counted, measured).statistic > 0.85
+    # More nodes in all, but less to eliminate.
+    many, few = grids.index(Grid(4, 4)), grids.index(Grid(1, 14))
+    assert measured[many] < measured[few] and counted[many] < counted[few]
 
 
 @pytest.mark.parametrize(
