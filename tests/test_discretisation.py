@@ -120,6 +120,23 @@ def test_few_hard_states_among_many_easy_ones_decide():
     assert discretise(arm, 1e-4, easy).grids != chosen.grids
 
 
+def test_grids_that_miss_together_are_chosen_again_with_half_the_share(monkeypatch):
+    arm = Arm([presets.bending_module()], presets.GRAVITY, presets.BELOW_BENDING)
+    drives, shares = np.array([[144.0, 64.0, 78.0], [120.0, 30.0, 90.0]]), []
+
+    def cheapest(k, share, fine, residual_tolerance):
+        shares.append(share)
+        return Grid(1, 3) if len(shares) < 3 else Grid(1, 9)
+
+    monkeypatch.setattr(discretisation, "_cheapest", cheapest)
+    assert discretise(arm, 1e-6, drives).grids == (Grid(1, 9),)
+    np.testing.assert_allclose(shares, 1e-6 / discretisation.SAFETY * np.array([1.0, 0.5, 0.25]))
+    shares[:] = []
+    monkeypatch.setattr(discretisation, "_cheapest", lambda *rest: Grid(1, 3))
+    with pytest.raises(ValueError, match=r"tolerance = 1e-06: expected one that grids of this arm can keep to"):
+        discretise(arm, 1e-6, drives)
+
+
 def test_states_without_equilibrium_do_not_decide():
     """A rod that is pushed far beyond buckling under a twisting payload may have none in reach; the other states decide."""
     arm = Arm([presets.bending_module()], presets.GRAVITY, presets.BELOW_BENDING)

@@ -792,7 +792,7 @@ def _solve_lanes(
     elements, nodes, length, a, b, stiffness, reference, first_muscle, route, mass_below, kind, parameters, rest_length,
     tolerance, ladder, strain, tension, from_drive, from_load, drive, load, tip, lengths, report,
 ):  # fmt: skip
-    """`solve_lanes` with the model's fields one by one: of a NamedTuple Numba works out the type at every call, in 3 us."""
+    """`solve_lanes` with the model's fields one by one: of a NamedTuple Numba works out the type anew at every call."""
     model = Model(
         elements, nodes, length, a, b, stiffness, reference, first_muscle, route, mass_below, kind, parameters, rest_length,
         tolerance, ladder,

@@ -120,7 +120,7 @@ def protocol(scenes: Sequence[Scene]) -> str:
         f"{FULL.budget:g} s and at least {FULL.least} cases (`--quick`: {QUICK.budget:g} s, {QUICK.least}), so slow methods "
         f"meet fewer cases.",
         "This package's solver is called as its environments call it, a batch of one, and the other compiled methods likewise, "
-        "without checks of arguments; `Arm.equilibrium` checks them and builds a result, which takes some 10 us more.",
+        "without checks of arguments; `Arm.equilibrium` checks them and builds a result, which takes time, too.",
         "The reference is another formulation at near round-off (`tca_envs.study.reference`): the wrench form of the rod as "
         "an initial value problem, integrated by Runge-Kutta steps of order 8 over short segments from base to tip (multiple "
         "shooting); Newton on the mismatches between segments, started on the branch of equilibria that the state before "
