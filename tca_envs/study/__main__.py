@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from tca_envs.study import ablation, output, paper, size, speed_accuracy, tolerance
+from tca_envs.study import ablation, output, paper, size, speed_accuracy, stability, tolerance
 from tca_envs.study.scenes import SCENES
 
 
@@ -46,6 +46,12 @@ STUDIES = {
     "tolerance": Study(
         lambda options: tolerance.run(options.out, options.quick),
         "check that tasks keep the tip error that they are asked for, and what a looser one saves",
+        ("matplotlib", "tqdm"),
+        _add_quick,
+    ),
+    "stability": Study(
+        lambda options: stability.run(options.out, options.quick),
+        "map where methods find the equilibrium that the arm is on, and where and how they fail",
         ("matplotlib", "tqdm"),
         _add_quick,
     ),

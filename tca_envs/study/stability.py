@@ -1,0 +1,428 @@
+"""Where methods fail: maps, a table and a chart of who finds the right branch of equilibria, and in what time.
+
+Families of cells (`stability_cells`) go from easy to hopeless: cold starts under large tensions and tip forces, long rods, the
+paper's thin arm with gravity from down to up, large steps of temperature. Every method solves every cell, once made ready and
+all in one run; failures are timed, too.
+"""
+
+import re
+import textwrap
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from math import isfinite, nan
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from tca_envs.mechanics import Arm, Equilibrium, Rung
+from tca_envs.study import output
+from tca_envs.study.chart import styles
+from tca_envs.study.method import Answer, Method, State
+from tca_envs.study.methods import bvp, paper, wrench_shooting
+from tca_envs.study.speed_accuracy import percent, si
+from tca_envs.study.stability_cells import FAMILIES, Cell, Family, Referee, Truth, grids
+from tca_envs.study.stability_judge import WORDS, Outcome, apart, outcome
+from tca_envs.study.timing import Known, label, timed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FULL, QUICK = 8, 3
+"""Cells a side of each map."""
+GRID = "elements of 15 mm, 8 nodes"
+
+
+class Ours(NamedTuple):
+    """`Arm.equilibrium`; where it has no answer, its guess is a result that says why."""
+
+    arm: Arm
+
+    def cold(self) -> None:
+        """Return the guess of a cold start."""
+        return None
+
+    def near(self, known: Equilibrium, state: State) -> Equilibrium:
+        """Return the known equilibrium."""
+        return known
+
+    def solve(self, state: State, guess: Equilibrium | None) -> Answer:
+        """Solve for the equilibrium at `state`."""
+        found = self.arm.equilibrium(state.drive, state.tip_force, start=guess, payload=state.payload)
+        return Answer(found.converged, found.tip_pose, found)
+
+
+def ours(arm: Arm, grid: str, states: Sequence[State]) -> Ours:
+    """Return the project's solver."""
+    return Ours(Arm(arm.modules, arm.gravity, arm.payload, grids(arm.modules), residual_tolerance=1e-6))
+
+
+OURS = Method("this package", "grid", (GRID,), ours)
+COMPARED: tuple[tuple[Method, object], ...] = (
+    (OURS, GRID),
+    (wrench_shooting.METHOD, 32),
+    *((method, 1e-3) for method in paper.METHODS),
+    (bvp.METHOD, 1e-3),
+)
+"""Methods, each at a setting in the middle of its range."""
+
+
+class Result(NamedTuple):
+    """What a method did on a cell."""
+
+    family: str
+    x: float
+    y: float
+    method: str
+    outcome: Outcome
+    seconds: float
+    """nan where the state before a step already had no answer."""
+    off: float
+    """Distance of the tip from that of the right answer, over the arm's length; nan where one is missing."""
+    jumps: int
+    """Jumps on the way to the right answer."""
+    lost: str
+    """Why there is none in reach; empty if there is one."""
+    doubt: str
+    """Why that is not to be trusted; empty where it is."""
+    note: str
+    """Of this package: which rung answered, or why there is no answer."""
+
+    @property
+    def counts(self) -> bool:
+        """Whether the cell has a right answer that is to be trusted."""
+        return not self.lost and not self.doubt
+
+    @property
+    def right(self) -> bool:
+        """Whether the method found it."""
+        return self.outcome is Outcome.RIGHT
+
+
+# Measuring
+
+
+def measure(
+    family: Family, methods: Sequence[tuple[Method, object]], referee: Referee, done: Callable[[], object]
+) -> list[Result]:
+    """Return what methods, at their settings, do on the cells of a family; `done` is called after each cell."""
+    results: list[Result] = []
+    warmed: set[str] = set()
+    for cell in family.cells:
+        state, truth = cell.case.state, referee(cell.case)
+        fine = Arm(state.arm.modules, state.arm.gravity, state.arm.payload, grids(state.arm.modules, 1.5))
+        for method, setting in methods:
+            solver = method.build(state.arm, setting, [state])
+            if method.name not in warmed:
+                solver.solve(state, solver.cold())  # compiles
+                warmed.add(method.name)
+            if cell.case.before is not None and truth.before is None:
+                answer, seconds = Answer(False, np.eye(4), None), nan
+            else:
+                answer, seconds = timed(solver, cell.case, Known(truth.before, np.zeros(3), 0.0))
+            what = outcome(state, answer, truth.found, fine)
+            results.append(result(family, cell, truth, method.name, answer, what, seconds))
+        done()
+    return results
+
+
+def result(family: Family, cell: Cell, truth: Truth, name: str, answer: Answer, what: Outcome, seconds: float) -> Result:
+    """Return the row of a method and a cell."""
+    known = answer.converged and truth.found is not None
+    off = apart(cell.case.state.arm, answer.tip, truth.found.tip_pose) if known and truth.found is not None else nan
+    note = ""
+    if name == OURS.name and isinstance(answer.guess, Equilibrium):
+        note = Rung(answer.guess.rung).name if answer.converged else answer.guess.message
+    return Result(family.name, cell.x, cell.y, name, what, seconds, off, truth.jumps, truth.lost, truth.doubt, note)
+
+
+# Findings
+
+
+def failure_rate(results: Sequence[Result]) -> float:
+    """Return the share of the cells with a right answer on which it was not found; nan if there are none."""
+    judged = [r for r in results if r.counts]
+    return sum(not r.right for r in judged) / len(judged) if judged else nan
+
+
+def times(results: Sequence[Result]) -> tuple[float, float]:
+    """Return median and longest time of a solve [s]; nan if there is none."""
+    taken = [r.seconds for r in results if isfinite(r.seconds)]
+    return (float(np.median(taken)), max(taken)) if taken else (nan, nan)
+
+
+def exceptions(results: Sequence[Result]) -> list[tuple[Result, list[str]]]:
+    """Return where this package misses a right answer that others find, and who they are."""
+    lost = {(r.family, r.x, r.y): r for r in results if r.method == OURS.name and r.counts and not r.right}
+    found: dict[tuple[str, float, float], list[str]] = {}
+    for r in results:
+        if r.right and (r.family, r.x, r.y) in lost:
+            found.setdefault((r.family, r.x, r.y), []).append(r.method)
+    return [(lost[place], names) for place, names in found.items()]
+
+
+def findings(results: Sequence[Result]) -> str:
+    """Return what the cells say, as Markdown."""
+    mine = [r for r in results if r.method == OURS.name]
+    judged = [r for r in mine if r.counts]
+    jumped, doubtful = sum(r.jumps > 0 for r in judged), sum(r.doubt != "" for r in mine)
+    names = list(dict.fromkeys(r.method for r in results))
+    rates = [f"{name} {percent(failure_rate([r for r in results if r.method == name]))}" for name in names]
+    return "\n\n".join(
+        [
+            f"{len(mine)} cells, {len(judged)} with a right answer; on {jumped} of them the arm falls to it from the end of a "
+            f"branch. {len(mine) - len(judged) - doubtful} have no equilibrium in reach, {doubtful} are in doubt: they count "
+            "for nobody.",
+            f"Not solved: {', '.join(rates)}.",
+            verdict(results),
+            soundness(mine),
+        ]
+    )
+
+
+def verdict(results: Sequence[Result]) -> str:
+    """Return whether this package finds the right branch wherever another method does, as Markdown."""
+    others = {(r.family, r.x, r.y) for r in results if r.counts and r.right and r.method != OURS.name}
+    cells = f"of {len(others)} cells where another method finds the right branch"
+    missed = exceptions(results)
+    lines = [f"{place(r)}: {WORDS[r.outcome]} ({r.note}); found by {', '.join(names)}" for r, names in missed]
+    if not lines:
+        return f"On every one {cells}, so does this package."
+    return f"On {len(lines)} {cells}, this package does not:\n\n{bullets(lines)}"
+
+
+def soundness(mine: Sequence[Result]) -> str:
+    """Return whether all answers of this package are stable equilibria, as Markdown."""
+    answers = [r for r in mine if r.outcome is not Outcome.NOTHING]
+    bad = [f"{place(r)}: {WORDS[r.outcome]}" for r in answers if r.outcome in (Outcome.UNSTABLE, Outcome.WRONG)]
+    if bad:
+        return f"{len(bad)} of {len(answers)} answers of this package are no stable equilibria:\n\n{bullets(bad)}"
+    return f"All {len(answers)} answers of this package are stable equilibria; on the other cells it says that it has none."
+
+
+def place(r: Result) -> str:
+    """Return where a cell is."""
+    return f"{r.family} at {r.x:.4g}, {r.y:.4g}"
+
+
+def table(results: Sequence[Result]) -> str:
+    """Return the table of success on the families, and times, for each method."""
+    families = list(dict.fromkeys(r.family for r in results))
+    header = ["Method", *families, "all", "wrong branch or none", "median time", "longest", "failures: median", "longest"]
+    rows = []
+    for name in dict.fromkeys(r.method for r in results):
+        of_method = [r for r in results if r.method == name]
+        groups = [[r for r in of_method if r.family == family] for family in families]
+        rates = [failure_rate(group) for group in [*groups, of_method]]
+        silent = [r for r in of_method if r.counts and r.outcome in (Outcome.OTHER, Outcome.UNSTABLE, Outcome.WRONG)]
+        spent = [*times(of_method), *times([r for r in of_method if r.counts and not r.right])]
+        shown = [percent(1.0 - rate) if isfinite(rate) else "--" for rate in rates]
+        rows.append([name, *shown, str(len(silent)), *(si(value, "s") for value in spent)])
+    return output.markdown_table(header, rows)
+
+
+def reasons(results: Sequence[Result]) -> str:
+    """Return why this package has no answer where it has none, as Markdown."""
+    silent = [r for r in results if r.method == OURS.name and r.outcome is Outcome.NOTHING]
+    lines = [
+        f"{place(r)}: {r.lost or 'there is an equilibrium'}; it says: {r.note or 'nothing, for the step has no start'}"
+        for r in silent
+    ]
+    return bullets(lines) or "It has an answer on every cell."
+
+
+HOW = """\
+The right answer is the equilibrium that a slow change reaches: drive and load go on a straight line from those of the
+start, the unloaded arm for a cold start, in steps that move the tip by at most 1 % of the length; where the branch of
+equilibria ends, the arm falls. That takes this package's solver, in tiny steps; so a walk in steps twice as long on a
+coarser grid must end at the same place, and multiple shooting to round-off (`tca_envs.study.reference`) must confirm the
+equilibrium, or the cell is in doubt. Where the section of a rod collapses under a muscle, whose path shrinks to a point,
+there is no equilibrium in reach.
+
+An answer is right if its tip is within 1 % of the length. What else a method answers is an equilibrium if multiple
+shooting, started from its shape, ends within 2 % of the length, and a stable one if the second variation of the energy is
+positive. A step starts from the method's own answer at the state before; where it has none, the step has none either.
+Times are medians of repeated solves on one machine, of a single solve where that takes more than 10 ms."""
+
+
+def report(results: Sequence[Result], families: Sequence[Family]) -> str:
+    """Return the page."""
+    mine = [r for r in results if r.method == OURS.name]
+    doubts = Counter(re.sub(r"[-+.\d]+(e-\d+)?( ?%)?", "x", r.doubt) for r in mine if r.doubt)
+    settings = [f"{method.name}: {method.knob} {label(setting)}" for method, setting in COMPARED]
+    maps = [f"{family.name}: {' '.join(family.title.split())}; {family.x_label}, {family.y_label}" for family in families]
+    return "\n\n".join(
+        [
+            "# Where methods fail",
+            findings(results),
+            "![Who finds the right branch where](stability_map.png)",
+            "![Failure rate, time, and what the answers are](failure_rate.png)",
+            "Cells on which the right branch is found; number of answers that are another branch or no equilibrium; time of a "
+            "solve on all cells and on those that are not solved:",
+            table(results),
+            "## Where this package has no answer",
+            reasons(results),
+            "## Cells in doubt",
+            bullets(f"{count} x {reason}" for reason, count in doubts.items()) or "None.",
+            "## How it was made",
+            HOW,
+            bullets(maps),
+            "Settings:",
+            bullets(settings),
+            "",
+        ]
+    )
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """Return a Markdown list."""
+    return "\n".join(f"* {line}" for line in lines)
+
+
+# Figures
+
+COLOURS = {
+    Outcome.RIGHT: "#9ad0f5",
+    Outcome.OTHER: "#E69F00",
+    Outcome.UNSTABLE: "#D55E00",
+    Outcome.WRONG: "#882255",
+    Outcome.NOTHING: "#444444",
+}
+"""Told apart by the colour-blind, and in grey by their lightness."""
+NO_TRUTH = "#ffffff"
+
+
+def draw_maps(results: Sequence[Result], families: Sequence[Family], path: Path) -> None:
+    """Draw a map for each family and method into a PNG file."""
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    names = list(dict.fromkeys(r.method for r in results))
+    figure = Figure(figsize=(2.0 * len(names) + 1.4, 1.75 * len(families) + 1.0), layout="constrained")
+    panels = figure.subplots(len(families), len(names), squeeze=False)
+    for row, family in enumerate(families):
+        for column, name in enumerate(names):
+            axes = panels[row, column]
+            draw_map(axes, family, [r for r in results if r.family == family.name and r.method == name], column == 0)
+            if row == 0:
+                axes.set_title(wrapped(name), fontsize=9.5, fontweight="bold" if name == OURS.name else None)
+        panels[row, -1].annotate(
+            family.title, (1.05, 0.5), xycoords="axes fraction", rotation=-90, va="center", ha="left", fontsize=8.5
+        )
+    entries: list[Line2D | Patch] = [Patch(facecolor=COLOURS[kind], label=WORDS[kind]) for kind in Outcome]
+    mark = {"linestyle": "none", "color": "black"}
+    entries.append(Line2D([], [], marker="o", markersize=3, label="the arm jumps on its way", **mark))
+    entries.append(Line2D([], [], marker="x", markersize=5, label="right answer in doubt", **mark))
+    entries.append(Line2D([], [], marker="_", markersize=6, label="no equilibrium in reach", **mark))
+    figure.legend(handles=entries, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    output.save_figure(figure, path)
+
+
+def draw_map(axes: "Axes", family: Family, group: Sequence[Result], labelled: bool) -> None:
+    """Draw what a method does on a family: a square for each cell, in the order of their values."""
+    from matplotlib.colors import ListedColormap
+
+    xs, ys = family.xs, family.ys
+    shown = np.full((len(ys), len(xs)), np.nan)
+    for r in group:
+        i, j = ys.index(r.y), xs.index(r.x)
+        if r.counts or (not r.doubt and r.outcome is not Outcome.NOTHING):
+            shown[i, j] = r.outcome
+        if r.doubt:
+            axes.plot(j, i, "x", color="black", markersize=3.5, markeredgewidth=0.8)
+        elif r.lost:
+            axes.plot(j, i, "_", color="black", markersize=5)
+        elif r.jumps:
+            colour = "white" if r.outcome is Outcome.NOTHING else "black"
+            axes.plot(j, i, "o", color=colour, markersize=2)
+    scheme = ListedColormap([COLOURS[kind] for kind in Outcome])
+    edges = [np.arange(len(values) + 1) - 0.5 for values in (xs, ys)]
+    axes.pcolormesh(*edges, shown, cmap=scheme, vmin=-0.5, vmax=len(Outcome) - 0.5, edgecolors="white", linewidth=0.5)
+    for axis, values in ((axes.xaxis, xs), (axes.yaxis, ys)):
+        places = sorted({round(p) for p in np.linspace(0, len(values) - 1, min(4, len(values)))})
+        axis.set_ticks(places, [f"{values[p]:.2g}" if values[p] < 10.0 else f"{values[p]:.0f}" for p in places])
+    axes.tick_params(labelsize=7.5, length=2, pad=1.5)
+    axes.set_xlabel(family.x_label, fontsize=8, labelpad=1)
+    if labelled:
+        axes.set_ylabel(family.y_label, fontsize=8, labelpad=1)
+    else:
+        axes.set_yticklabels([])
+
+
+def wrapped(name: str) -> str:
+    """Return a method's name in lines of a column's width."""
+    return "\n".join(textwrap.wrap(name, 22))
+
+
+def draw_rates(results: Sequence[Result], path: Path) -> None:
+    """Draw each method's failure rate over its time, and what its answers are, into a PNG file."""
+    from matplotlib.ticker import EngFormatter, PercentFormatter
+
+    names = list(dict.fromkeys(r.method for r in results))
+    figure, (left, right) = output.new_figure(2, 10.0, 4.4, width_ratios=[1.15, 1.0])
+    for name, style in styles(names, OURS.name).items():
+        of_method = [r for r in results if r.method == name]
+        (median, longest), rate = times(of_method), failure_rate(of_method)
+        left.plot([rate, rate], [median, longest], color=style["color"], linewidth=1.0, alpha=0.6)
+        left.plot([rate], [longest], color=style["color"], marker="_", markersize=9)
+        left.plot([rate], [median], label=name, **{**style, "linestyle": "none", "markersize": 9})
+    left.set(yscale="log", xlabel="cells not solved", ylabel="time of a solve, median to longest")
+    left.yaxis.set_major_formatter(EngFormatter(unit="s", sep=" "))
+    left.margins(x=0.08)
+    for row, name in enumerate(names):
+        judged = [r.outcome for r in results if r.method == name and r.counts]
+        begin = 0.0
+        for kind in Outcome:
+            share = judged.count(kind) / max(len(judged), 1)
+            right.barh(row, share, left=begin, height=0.6, color=COLOURS[kind], label=WORDS[kind] if row == 0 else None)
+            begin += share
+    right.set_yticks(range(len(names)), [wrapped(name) for name in names], fontsize=8.5)
+    right.set(ylim=(len(names) - 0.5, -0.5), xlim=(0.0, 1.0), xlabel="cells")
+    right.grid(visible=False)
+    for axes in (left, right):
+        axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False, fontsize=8.5, columnspacing=1.2)
+    output.save_figure(figure, path)
+
+
+# The command
+
+
+HEADER = (
+    "family", "x", "y", "method", "outcome", "seconds", "tip_off_relative", "jumps", "lost", "doubt", "note",
+)  # fmt: skip
+
+
+def write(results: Sequence[Result], path: Path) -> None:
+    """Write a row for each cell and method."""
+    output.write_csv(path, HEADER, [(*r[:4], r.outcome.name.lower(), *r[5:]) for r in results])
+
+
+def run(out: Path, quick: bool = False, say: Callable[[str], object] = print) -> None:
+    """Measure, and write stability (.csv, .md), stability_map.png and failure_rate.png into the folder `out`.
+
+    Parameters
+    ----------
+    out : Path
+        A folder that exists.
+    quick : bool
+        Small maps: for a look.
+    say : callable
+        Told what was found and written.
+    """
+    from tqdm import tqdm
+
+    families = [build(QUICK if quick else FULL) for build in FAMILIES.values()]
+    results: list[Result] = []
+    referee = Referee()
+    with tqdm(total=sum(len(family.cells) for family in families), unit="cell") as bar:
+        for family in families:
+            bar.set_description(family.name)
+            results += measure(family, COMPARED, referee, bar.update)
+    write(results, out / "stability.csv")
+    draw_maps(results, families, out / "stability_map.png")
+    draw_rates(results, out / "failure_rate.png")
+    (out / "stability.md").write_text(report(results, families), encoding="utf-8")
+    say(findings(results))
+    say(f"wrote stability (.csv, .md), stability_map.png and failure_rate.png in {out}")

@@ -1,0 +1,324 @@
+"""The cells of the stability study, and on which branch of equilibria the right answer to each of them lies.
+
+The right answer is what a slow change reaches. Drive and load go on a straight line from those of the start, the unloaded arm
+for a cold start, to the asked ones, in steps so small that the tip hardly moves in any of them. Where the branch of equilibria
+ends on the way, the arm jumps. A walk in half the steps on a finer grid has to end at the same place, and an independent solver
+has to find the same equilibrium: otherwise the cell is in doubt and says nothing about anyone.
+"""
+
+from collections.abc import Callable, Sequence
+from math import ceil, cos, pi, radians, sin
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tca_envs import presets
+from tca_envs.mechanics import Arm, Equilibrium, Grid, Module, Muscle, Payload, Tendon
+from tca_envs.mechanics.collocation import PAYLOAD_MASS
+from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
+from tca_envs.study.method import State
+from tca_envs.study.reference import NoReference, reference
+from tca_envs.study.scenes import LONG_DENSITY, Case
+
+Array = NDArray[np.float64]
+
+ROD_LENGTH, ROD_RADIUS, ROD_OFFSET = 45e-3, 4.5e-3, 4e-3
+"""The rod of the closed forms in docs/model.md and its tendon [m]."""
+OFF_AXIS = 1.0
+"""Gravity is so far off the planes of symmetry [deg]: no arm is mounted exactly, and a symmetric one may fall to any side."""
+TURNED = 20.0
+"""Azimuth of gravity where it is not along the arm [deg]: in no plane of symmetry of the three TCAs."""
+
+TENSION, FORCE = 1.8, 0.6
+"""Largest tension of the tendon and tip force [N]."""
+FIXED_TENSION, FIXED_FORCE = 0.3, 0.05
+"""Where the other one is on an axis of the map [N]."""
+LENGTHS = (45.0, 60.0, 80.0, 105.0, 135.0, 170.0, 210.0, 250.0)
+"""[mm]."""
+TILTS = (OFF_AXIS, 30.0, 60.0, 90.0, 120.0, 150.0, 165.0, 180.0 - OFF_AXIS)
+"""Of gravity from the arm's axis [deg]: it hangs at 0, and would stand at 180."""
+TEMPERATURES = (25.0, 45.0, 65.0, 85.0, 105.0, 125.0, 145.0, 160.0)
+"""[degC]."""
+STEPS = (1.0, 2.0, 5.0, 10.0, 20.0, 45.0, 90.0, 135.0)
+"""Of the temperatures [K]; the last one is from ambient to the hard limit."""
+
+STRIDE = 0.02
+"""The tip moves at most so far in a step of the slow change, over the arm's length."""
+SMALLEST = 1e-6
+"""Smallest step of drive and load, over the whole change: what moves the tip farther is a jump."""
+MAX_STEPS = 4000
+ELEMENT = 15e-3
+"""Length of the elements of the slow change [m]; those of the check are two thirds of that."""
+NODES = 8
+COLLAPSED = 0.02
+"""A muscle has shrunk to a point where a metre of the centerline takes less of it than this [m]."""
+COLLAPSE = "a muscle's path shrinks to a point: the section collapses, as real coils would not let it"
+AGREE = 1e-3
+"""Ends of slow changes that are closer than this, over the arm's length, are the same equilibrium."""
+
+
+class Cell(NamedTuple):
+    """A place on a map."""
+
+    x: float
+    y: float
+    case: Case
+
+
+class Family(NamedTuple):
+    """A map."""
+
+    name: str
+    title: str
+    x_label: str
+    y_label: str
+    cells: tuple[Cell, ...]
+
+    @property
+    def xs(self) -> list[float]:
+        """Values along x, in order."""
+        return sorted({cell.x for cell in self.cells})
+
+    @property
+    def ys(self) -> list[float]:
+        """Values along y, in order."""
+        return sorted({cell.y for cell in self.cells})
+
+
+class Walk(NamedTuple):
+    """Where a slow change ended."""
+
+    found: Equilibrium | None
+    """None where the arm has no equilibrium in reach."""
+    jumps: int
+    """So often it fell from the end of a branch."""
+    lost: str
+    """Why there is none."""
+
+
+class Truth(NamedTuple):
+    """What the right answer of a cell is."""
+
+    before: Equilibrium | None
+    """Equilibrium at the state before, for a warm start."""
+    found: Equilibrium | None
+    """None where the slow change finds no equilibrium in reach."""
+    jumps: int
+    """Jumps on the way from the start."""
+    lost: str
+    """Why there is none."""
+    doubt: str
+    """Why all this is not to be trusted; empty where it is."""
+
+
+# Cells
+
+
+def every(values: Sequence[float], count: int) -> list[float]:
+    """Return `count` of the values (all, if there are no more), evenly spaced, the first and the last among them."""
+    places = np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int)
+    return [values[place] for place in places]
+
+
+def rod(length: float) -> Arm:
+    """Return a rod [m] with one straight tendon, gravity across it, on the side of the tendon."""
+    muscle = Muscle(ROD_OFFSET, 0.0, 0.0, Tendon())
+    mass = LONG_DENSITY * pi * ROD_RADIUS**2 * length
+    module = Module.cylinder(length, 2.0 * ROD_RADIUS, presets.YOUNGS_MODULUS, presets.SHEAR_MODULUS, mass, [muscle])
+    off = radians(OFF_AXIS)
+    return Arm([module], presets.GRAVITY[2] * np.array([cos(off), sin(off), 0.0]), grids=grids([module]))
+
+
+def tilted(tilt: float) -> Arm:
+    """Return the paper's bending module with the rest of the arm on its end, gravity `tilt` [deg] from its axis."""
+    angle, turned = radians(tilt), radians(TURNED)
+    gravity = np.array([sin(angle) * cos(turned), sin(angle) * sin(turned), cos(angle)])
+    module = presets.bending_module()
+    return Arm([module], presets.GRAVITY[2] * gravity, presets.BELOW_BENDING, grids([module]))
+
+
+def grids(modules: Sequence[Module], finer: float = 1.0) -> list[Grid]:
+    """Return grids with elements of `ELEMENT`/finer."""
+    return [Grid(ceil(finer * module.length / ELEMENT), NODES) for module in modules]
+
+
+def tension_force(count: int) -> Family:
+    """Return cold starts of the rod under tension and a tip force across both tendon and gravity."""
+    arm = rod(ROD_LENGTH)
+    values = [(t, f) for t in np.linspace(0.0, TENSION, count).tolist() for f in np.linspace(0.0, FORCE, count).tolist()]
+    cells = [Cell(t, f, Case(None, State(arm, np.array([t]), (0.0, f, 0.0)))) for t, f in values]
+    return Family("tension-force", "cold start\nrod of 45 mm", "tension [N]", "tip force [N]", tuple(cells))
+
+
+def length_tension(count: int) -> Family:
+    """Return cold starts of rods of many lengths under tension."""
+    cells = []
+    for length in every(LENGTHS, count):
+        arm = rod(1e-3 * length)
+        for t in np.linspace(0.0, TENSION, count).tolist():
+            cells.append(Cell(length, t, Case(None, State(arm, np.array([t]), (0.0, FIXED_FORCE, 0.0)))))
+    title = f"cold start, rods,\ntip force {FIXED_FORCE:g} N"
+    return Family("length-tension", title, "length [mm]", "tension [N]", tuple(cells))
+
+
+def length_force(count: int) -> Family:
+    """Return cold starts of rods of many lengths under a tip force."""
+    cells = []
+    for length in every(LENGTHS, count):
+        arm = rod(1e-3 * length)
+        for f in np.linspace(0.0, FORCE, count).tolist():
+            cells.append(Cell(length, f, Case(None, State(arm, np.array([FIXED_TENSION]), (0.0, f, 0.0)))))
+    title = f"cold start, rods,\ntension {FIXED_TENSION:g} N"
+    return Family("length-force", title, "length [mm]", "tip force [N]", tuple(cells))
+
+
+def cold_tilt(count: int) -> Family:
+    """Return cold starts of the paper's bending module with two TCAs hot."""
+    cells = []
+    for tilt in every(TILTS, count):
+        arm = tilted(tilt)
+        for t in every(TEMPERATURES, count):
+            cells.append(Cell(tilt, t, Case(None, State(arm, np.array([AMBIENT, t, t])))))
+    title = "cold start\n4.5 mm arm,\ntwo TCAs hot"
+    return Family("cold-tilt", title, "gravity, from down to up [deg]", "TCAs [°C]", tuple(cells))
+
+
+def step_tilt(count: int) -> Family:
+    """Return steps of one TCA up from ambient."""
+    cells = []
+    for tilt in every(TILTS, count):
+        arm = tilted(tilt)
+        before = State(arm, np.full(3, AMBIENT))
+        for step in every(STEPS, count):
+            cells.append(Cell(tilt, step, Case(before, State(arm, np.array([AMBIENT + step, AMBIENT, AMBIENT])))))
+    title = "step from 25 °C\n4.5 mm arm,\none TCA"
+    return Family("step-tilt", title, "gravity, from down to up [deg]", "step [K]", tuple(cells))
+
+
+def random_tilt(count: int) -> Family:
+    """Return steps of all three TCAs, each up or down, from random temperatures."""
+    rng = np.random.default_rng(0)
+    cells = []
+    for tilt in every(TILTS, count):
+        arm = tilted(tilt)
+        for step in every(STEPS, count):
+            lowest = rng.uniform(AMBIENT, HARD_LIMIT - step, 3)
+            up = rng.random(3) < 0.5
+            before, after = np.where(up, lowest, lowest + step), np.where(up, lowest + step, lowest)
+            cells.append(Cell(tilt, step, Case(State(arm, before), State(arm, after))))
+    title = "step from a random\nstate, 4.5 mm arm,\nthree TCAs"
+    return Family("random-tilt", title, "gravity, from down to up [deg]", "step [K]", tuple(cells))
+
+
+FAMILIES: dict[str, Callable[[int], Family]] = {
+    "tension-force": tension_force, "length-tension": length_tension, "length-force": length_force, "cold-tilt": cold_tilt,
+    "step-tilt": step_tilt, "random-tilt": random_tilt,
+}  # fmt: skip
+"""Name -> builder of a map of so many cells a side."""
+
+
+# The right branch
+
+
+def follow(state: State, start: Equilibrium | None, stride: float = STRIDE, finer: float = 1.0) -> Walk:
+    """Go slowly from an equilibrium, or from the unloaded arm, to a state.
+
+    Parameters
+    ----------
+    state : State
+        What is asked.
+    start : Equilibrium, optional
+        Where the arm comes from.
+    stride : float
+        The tip moves at most so far in a step, over the arm's length.
+    finer : float
+        So much finer is the grid than the usual one.
+    """
+    arm = state.arm
+    if start is None:
+        _, _, from_drive, from_load = arm.unloaded()
+        tip = np.array([0.0, 0.0, arm.length])
+    else:
+        from_drive, from_load = start.known
+        tip = start.tip_pose[:3, 3]
+    grid, jumps, done, step = grids(arm.modules, finer), 0, 0.0, 1e-3
+    for _ in range(MAX_STEPS):
+        here = min(1.0, done + step)
+        drive, load = from_drive + here * (state.drive - from_drive), from_load + here * (state.load - from_load)
+        found = at(arm, load, grid).equilibrium(drive, load[:3], load[3:6], start=start)
+        moved = float(np.linalg.norm(found.tip_pose[:3, 3] - tip)) / (stride * arm.length)
+        smooth = found.converged and not found.jumped and moved <= 1.0
+        if not smooth and step > SMALLEST:
+            step = max(0.25 * step, SMALLEST)
+            continue
+        if not found.converged:
+            return Walk(None, jumps, _end(start, found))
+        jumps += not smooth
+        start, tip, done = found, found.tip_pose[:3, 3], here
+        if here == 1.0:
+            return Walk(found, jumps, "")
+        step *= min(2.0, 0.8 / max(moved, 1e-3))
+    return Walk(None, jumps, f"not there after {MAX_STEPS} steps")
+
+
+def _end(last: Equilibrium | None, failed: Equilibrium) -> str:
+    """Return why a slow change has no equilibrium after its last one."""
+    if last is not None and narrowest(last) < COLLAPSED:
+        return COLLAPSE
+    return failed.message
+
+
+def narrowest(known: Equilibrium) -> float:
+    """Return the smallest |p'| of a muscle at the nodes of an equilibrium, 1 for a straight one in an unloaded rod."""
+    assert known.nodes is not None
+    model, strain = known.nodes
+    u, v = strain[:, np.newaxis, :3], strain[:, np.newaxis, 3:]
+    x, y, dx, dy = np.moveaxis(model.route, -1, 0)
+    path = [v[..., 0] - u[..., 2] * y + dx, v[..., 1] + u[..., 2] * x + dy, v[..., 2] + u[..., 0] * y - u[..., 1] * x]
+    return float(np.linalg.norm(path, axis=0).min())
+
+
+def at(arm: Arm, load: Array, grid: Sequence[Grid]) -> Arm:
+    """Return the arm with the gravity and the payload of a load."""
+    mass, x, y, z = load[PAYLOAD_MASS:].tolist()
+    return Arm(arm.modules, load[6:9], Payload(mass, (x, y, z)), grid)
+
+
+class Referee:
+    """Tells the right answers; states before, which many cells share, are gone to once."""
+
+    def __init__(self) -> None:
+        self._walks: dict[tuple[State, float], Walk] = {}
+
+    def _walk(self, state: State, stride: float, finer: float) -> Walk:
+        key = state, finer
+        if key not in self._walks:
+            self._walks[key] = follow(state, None, stride, finer)
+        return self._walks[key]
+
+    def __call__(self, case: Case) -> Truth:
+        """Return the right answer of a cell."""
+        ends, befores = [], []
+        for stride, finer in ((STRIDE, 1.0), (0.5 * STRIDE, 1.5)):
+            before = None if case.before is None else self._walk(case.before, stride, finer)
+            if before is not None and before.found is None:
+                return Truth(None, None, before.jumps, f"where the step starts: {before.lost}", "")
+            befores.append(before.found if before is not None else None)
+            ends.append(follow(case.state, befores[-1], stride, finer))
+        one, other = ends
+        return Truth(befores[1], other.found, other.jumps, other.lost, doubt(case.state, one.found, other.found))
+
+
+def doubt(state: State, one: Equilibrium | None, other: Equilibrium | None) -> str:
+    """Return why two ends of a slow change, the second on a finer grid, are not to be trusted; empty if they are."""
+    if one is None or other is None:
+        return "" if one is other else "only one of two slow changes finds an equilibrium"
+    apart = float(np.linalg.norm(one.tip_pose[:3, 3] - other.tip_pose[:3, 3])) / state.arm.length
+    if apart > AGREE:
+        return f"slow changes end {apart:.1%} of the length apart"
+    try:
+        moved = reference(state, other).moved / state.arm.length
+    except NoReference as reason:
+        return f"not confirmed: {reason}"
+    return "" if moved < AGREE else f"confirmed {moved:.1%} of the length away"

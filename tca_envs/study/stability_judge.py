@@ -1,0 +1,140 @@
+"""What an answer is that is not the right one: another equilibrium, stable or not, or none at all.
+
+An answer is an equilibrium where the reference solver, started from its shape, ends next to it. Methods that shoot or integrate
+know moments and tensions; their strains follow from the balance of the sections.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+
+from tca_envs.mechanics import Arm, Equilibrium, section
+from tca_envs.mechanics.arm import pose
+from tca_envs.mechanics.collocation import PAYLOAD_MASS
+from tca_envs.mechanics.ladder import smallest_eigenvalue
+from tca_envs.mechanics.shooting import quaternion_rate
+from tca_envs.study.method import Answer, State
+from tca_envs.study.methods import bvp
+from tca_envs.study.reference import NoReference, reference
+
+Array = NDArray[np.float64]
+
+NEAR = 0.01
+"""Tips that are closer than this, over the arm's length, are of one equilibrium."""
+FARTHEST = 0.02
+"""An answer whose tip is farther than this from the equilibrium that it leads to, over the arm's length, is none."""
+STATES = 7
+"""Quaternion and moment."""
+
+
+class Outcome(IntEnum):
+    """What a method makes of a cell."""
+
+    RIGHT = 0
+    OTHER = 1
+    UNSTABLE = 2
+    WRONG = 3
+    NOTHING = 4
+
+
+WORDS = {
+    Outcome.RIGHT: "right branch, stable",
+    Outcome.OTHER: "another stable equilibrium",
+    Outcome.UNSTABLE: "an unstable equilibrium",
+    Outcome.WRONG: "an answer that is no equilibrium",
+    Outcome.NOTHING: "no answer",
+}
+
+
+def outcome(state: State, answer: Answer, right: Equilibrium | None, fine: Arm) -> Outcome:
+    """Return what an answer is.
+
+    Parameters
+    ----------
+    state : State
+        What was asked; of an arm of one module.
+    answer : Answer
+        What a method said: the project's, the paper's, wrench shooting or `solve_bvp`.
+    right : Equilibrium, optional
+        The right answer, if there is one.
+    fine : Arm
+        The arm on a fine grid.
+    """
+    if not answer.converged:
+        return Outcome.NOTHING
+    if right is not None and apart(state.arm, answer.tip, right.tip_pose) <= NEAR:
+        # Close to a fold the unstable equilibrium may be as near; who knows the strains is asked.
+        return Outcome.RIGHT if not isinstance(answer.guess, Equilibrium) or answer.guess.stable else Outcome.UNSTABLE
+    try:
+        near = shape(state, answer)
+        found = reference(state, near)
+        strain = near.sample(fine.node_arc)[1]
+        stability = smallest_eigenvalue(fine.model, strain, near.tensions, state.drive, state.load)
+    except (NoReference, ArithmeticError, ValueError, np.linalg.LinAlgError):
+        return Outcome.WRONG
+    if found.moved > FARTHEST * state.arm.length:
+        return Outcome.WRONG
+    return Outcome.OTHER if stability > 0.0 else Outcome.UNSTABLE
+
+
+def apart(arm: Arm, tip: Array, other: Array) -> float:
+    """Return the distance of two tips, poses (4, 4), over the arm's length."""
+    return float(np.linalg.norm(tip[:3, 3] - other[:3, 3])) / arm.length
+
+
+def shape(state: State, answer: Answer) -> Equilibrium:
+    """Return the shape of an answer, as far as `reference` reads it."""
+    guess: Any = answer.guess
+    if isinstance(guess, Equilibrium):
+        return guess
+    if isinstance(guess, bvp.Guess):
+        unit = bvp.build(state.arm, 1.0, ()).model.unit[0]
+        scale = np.repeat([1.0, unit], [4, 3])[:, np.newaxis]
+        carried: Callable[[float], Array] = CubicSpline(state.arm.length * guess.x, scale * guess.y[:STATES], axis=1)
+    else:
+        carried = integrated(state, guess.moment, guess.tension)
+
+    def sample(s: Array) -> tuple[Array, Array]:
+        rows = [carried(at) for at in s]
+        poses = np.array([pose(row[:4], np.zeros(3)) for row in rows])
+        return poses, np.array([balanced(state, at, row, guess.tension) for at, row in zip(s, rows, strict=True)])
+
+    unloaded = state.arm.equilibrium(state.arm.unloaded()[2])
+    return replace(unloaded, tip_pose=answer.tip, tensions=guess.tension, sample=sample)
+
+
+def integrated(state: State, moment: Array, tension: Array) -> Callable[[float], Array]:
+    """Return quaternion and moment (7,) along an arm as a function of s [m], from the moment at its base."""
+
+    def rate(s: float, y: Array) -> Array:
+        strain = balanced(state, s, y, tension)
+        rotation = pose(y[:4], np.zeros(3))[:3, :3]
+        return np.concatenate([quaternion_rate(y[:4], strain[:3]), np.cross(force(state, s), rotation @ strain[3:])])
+
+    first = np.concatenate([[1.0, 0.0, 0.0, 0.0], moment])
+    size = float(state.arm.modules[0].stiffness[0] / state.arm.length)
+    absolute = np.repeat([1e-8, 1e-8 * size], [4, 3])
+    answer = solve_ivp(rate, (0.0, state.arm.length), first, rtol=1e-8, atol=absolute, dense_output=True)
+    if not answer.success:
+        raise ArithmeticError(answer.message)
+    return answer.sol  # type: ignore[no-any-return]
+
+
+def force(state: State, s: float) -> Array:
+    """Return the total force [N] at s [m], in the base frame."""
+    load, module = state.load, state.arm.modules[0]
+    return load[:3] + (load[PAYLOAD_MASS] + module.mass_per_length * (module.length - s)) * load[6:9]
+
+
+def balanced(state: State, s: float, row: Array, tension: Array) -> Array:
+    """Return the strain (6,) at s [m] that carries the moment of a row (7,) of quaternion and moment."""
+    module, rotation = state.arm.modules[0], pose(row[:4], np.zeros(3))[:3, :3]
+    route = np.array([module.route(muscle, s / module.length) for muscle in module.muscles])
+    wrench = np.concatenate([row[4:] @ rotation, force(state, s) @ rotation])
+    return section.solve(module.stiffness, module.reference_strain, route, tension, wrench, module.reference_strain)
