@@ -311,10 +311,9 @@ def draw_maps(results: Sequence[Result], families: Sequence[Family], path: Path)
             family.title, (1.05, 0.5), xycoords="axes fraction", rotation=-90, va="center", ha="left", fontsize=8.5
         )
     entries: list[Line2D | Patch] = [Patch(facecolor=COLOURS[kind], label=WORDS[kind]) for kind in Outcome]
-    mark = {"linestyle": "none", "color": "black"}
-    entries.append(Line2D([], [], marker="o", markersize=3, label="the arm jumps on its way", **mark))
-    entries.append(Line2D([], [], marker="x", markersize=5, label="right answer in doubt", **mark))
-    entries.append(Line2D([], [], marker="_", markersize=6, label="no equilibrium in reach", **mark))
+    marks = (("o", 3, "the arm falls on its way"), ("x", 5, "right answer in doubt"), ("_", 6, "no equilibrium in reach"))
+    for marker, size, text in marks:
+        entries.append(Line2D([], [], color="black", linestyle="none", marker=marker, markersize=size, label=text))
     figure.legend(handles=entries, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     output.save_figure(figure, path)
 

@@ -45,7 +45,7 @@ STEPS = (1.0, 2.0, 5.0, 10.0, 20.0, 45.0, 90.0, 135.0)
 
 STRIDE = 0.02
 """The tip moves at most so far in a step of the slow change, over the arm's length."""
-SMALLEST = 1e-6
+SMALLEST = 1e-5
 """Smallest step of drive and load, over the whole change: what moves the tip farther is a jump."""
 MAX_STEPS = 4000
 ELEMENT = 15e-3
@@ -250,7 +250,7 @@ def follow(state: State, start: Equilibrium | None, stride: float = STRIDE, fine
         moved = float(np.linalg.norm(found.tip_pose[:3, 3] - tip)) / (stride * arm.length)
         smooth = found.converged and not found.jumped and moved <= 1.0
         if not smooth and step > SMALLEST:
-            step = max(0.25 * step, SMALLEST)
+            step = max((0.1 if found.jumped or not found.converged else 0.25) * step, SMALLEST)
             continue
         if not found.converged:
             return Walk(None, jumps, _end(start, found))

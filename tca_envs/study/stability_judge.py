@@ -123,7 +123,7 @@ def integrated(state: State, moment: Array, tension: Array) -> Callable[[float],
     answer = solve_ivp(rate, (0.0, state.arm.length), first, rtol=1e-8, atol=absolute, dense_output=True)
     if not answer.success:
         raise ArithmeticError(answer.message)
-    return answer.sol  # type: ignore[no-any-return]
+    return answer.sol
 
 
 def force(state: State, s: float) -> Array:
