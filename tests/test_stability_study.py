@@ -56,9 +56,11 @@ def test_a_collapsed_section_is_no_equilibrium():
 def test_slow_changes_that_disagree_are_in_doubt():
     arm = stability_cells.rod(45e-3)
     state = State(arm, np.array([0.3]))
-    here, there = arm.equilibrium([0.3]), arm.equilibrium([0.2])
-    assert stability_cells.doubt(state, here, here) == "" == stability_cells.doubt(state, None, None)
-    assert "only one" in stability_cells.doubt(state, here, None)
+    here, there = (stability_cells.Walk(arm.equilibrium([tension]), 0, "") for tension in (0.3, 0.2))
+    collapsed, lost = (stability_cells.Walk(None, 0, why) for why in (stability_cells.COLLAPSE, "too long"))
+    assert stability_cells.doubt(state, here, here) == "" == stability_cells.doubt(state, collapsed, collapsed)
+    assert "only one" in stability_cells.doubt(state, here, collapsed)
+    assert "nothing collapses: too long" in stability_cells.doubt(state, lost, lost)
     assert "apart" in stability_cells.doubt(state, here, there)
     assert "confirmed" in stability_cells.doubt(state, there, there)
 

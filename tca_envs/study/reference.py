@@ -264,7 +264,7 @@ def newton(cut: Segments, guess: Guess, state: State, inverse: Array | None) -> 
     raise NoReference(f"Newton stopped at a residual of {size:.1e}")
 
 
-def reference(state: State, near: Equilibrium) -> Reference:
+def reference(state: State, near: Equilibrium, still: float = STILL) -> Reference:
     """Find the equilibrium at `state` to round-off.
 
     Parameters
@@ -273,6 +273,8 @@ def reference(state: State, near: Equilibrium) -> Reference:
         What is asked.
     near : Equilibrium
         An equilibrium there on a fine grid: the reference is on its branch.
+    still : float
+        Steps are fine enough where doubling them moves the tip by less than this, over the arm's length.
 
     Returns
     -------
@@ -300,6 +302,6 @@ def reference(state: State, near: Equilibrium) -> Reference:
         residual, ends, inverse = newton(segments(arm, doubling), guess, state, inverse)
         tip = pose(ends[-1, :4], ends[:, 4:7].sum(axis=0))
         error, last = float(np.linalg.norm(tip[:3, 3] - last)), tip[:3, 3]
-        if doubling > 0 and error < STILL * arm.length:
+        if doubling > 0 and error < still * arm.length:
             return Reference(tip, guess.tension, residual, error, float(np.linalg.norm(last - near.tip_pose[:3, 3])))
     raise NoReference(f"twice as many steps still move the tip by {error:.1e} m")

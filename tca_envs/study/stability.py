@@ -28,7 +28,7 @@ from tca_envs.study.timing import Known, label, timed
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FULL, QUICK = 8, 3
+FULL, QUICK = 8, 2
 """Cells a side of each map."""
 GRID = "elements of 15 mm, 8 nodes"
 
@@ -239,9 +239,9 @@ coarser grid must end at the same place, and multiple shooting to round-off (`tc
 equilibrium, or the cell is in doubt. Where the section of a rod collapses under a muscle, whose path shrinks to a point,
 there is no equilibrium in reach.
 
-An answer is right if its tip is within 1 % of the length. What else a method answers is an equilibrium if multiple
-shooting, started from its shape, ends within 2 % of the length, and a stable one if the second variation of the energy is
-positive. A step starts from the method's own answer at the state before; where it has none, the step has none either.
+An answer is an equilibrium if multiple shooting, started from its shape, ends within 2 % of the length, and a stable one
+if the second variation of the energy is positive; it is right if that equilibrium is the right one, or if its tip is
+within 1 % of it. A step starts from the method's own answer at the state before; where it has none, the step has none.
 Times are medians of repeated solves on one machine, of a single solve where that takes more than 10 ms."""
 
 

@@ -45,6 +45,8 @@ STEPS = (1.0, 2.0, 5.0, 10.0, 20.0, 45.0, 90.0, 135.0)
 
 STRIDE = 0.02
 """The tip moves at most so far in a step of the slow change, over the arm's length."""
+MOST_JUMPS = 5
+"""A slow change that falls more often does not know where it is."""
 SMALLEST = 1e-5
 """Smallest step of drive and load, over the whole change: what moves the tip farther is a jump."""
 MAX_STEPS = 4000
@@ -54,8 +56,10 @@ NODES = 8
 COLLAPSED = 0.02
 """A muscle has shrunk to a point where a metre of the centerline takes less of it than this [m]."""
 COLLAPSE = "a muscle's path shrinks to a point: the section collapses, as real coils would not let it"
-AGREE = 1e-3
+AGREE = 5e-3
 """Ends of slow changes that are closer than this, over the arm's length, are the same equilibrium."""
+CONFIRMED = 1e-5
+"""Error of the independent solver that confirms them, over the arm's length."""
 
 
 class Cell(NamedTuple):
@@ -255,6 +259,8 @@ def follow(state: State, start: Equilibrium | None, stride: float = STRIDE, fine
         if not found.converged:
             return Walk(None, jumps, _end(start, found))
         jumps += not smooth
+        if jumps > MOST_JUMPS:
+            return Walk(None, jumps, f"it falls more than {MOST_JUMPS} times on its way")
         start, tip, done = found, found.tip_pose[:3, 3], here
         if here == 1.0:
             return Walk(found, jumps, "")
@@ -306,19 +312,20 @@ class Referee:
                 return Truth(None, None, before.jumps, f"where the step starts: {before.lost}", "")
             befores.append(before.found if before is not None else None)
             ends.append(follow(case.state, befores[-1], stride, finer))
-        one, other = ends
-        return Truth(befores[1], other.found, other.jumps, other.lost, doubt(case.state, one.found, other.found))
+        return Truth(befores[1], *ends[1], doubt(case.state, *ends))
 
 
-def doubt(state: State, one: Equilibrium | None, other: Equilibrium | None) -> str:
-    """Return why two ends of a slow change, the second on a finer grid, are not to be trusted; empty if they are."""
-    if one is None or other is None:
-        return "" if one is other else "only one of two slow changes finds an equilibrium"
-    apart = float(np.linalg.norm(one.tip_pose[:3, 3] - other.tip_pose[:3, 3])) / state.arm.length
+def doubt(state: State, one: Walk, other: Walk) -> str:
+    """Return why two slow changes to a state, the second on a finer grid, are not to be trusted; empty if they are."""
+    if one.found is None or other.found is None:
+        if one.found is not other.found:
+            return "only one of two slow changes finds an equilibrium"
+        return "" if other.lost == COLLAPSE else f"no equilibrium, though nothing collapses: {other.lost}"
+    apart = float(np.linalg.norm(one.found.tip_pose[:3, 3] - other.found.tip_pose[:3, 3])) / state.arm.length
     if apart > AGREE:
         return f"slow changes end {apart:.1%} of the length apart"
     try:
-        moved = reference(state, other).moved / state.arm.length
+        moved = reference(state, other.found, CONFIRMED).moved / state.arm.length
     except NoReference as reason:
         return f"not confirmed: {reason}"
     return "" if moved < AGREE else f"confirmed {moved:.1%} of the length away"

@@ -22,6 +22,7 @@ from tca_envs.mechanics.shooting import quaternion_rate
 from tca_envs.study.method import Answer, State
 from tca_envs.study.methods import bvp
 from tca_envs.study.reference import NoReference, reference
+from tca_envs.study.stability_cells import CONFIRMED
 
 Array = NDArray[np.float64]
 
@@ -73,14 +74,17 @@ def outcome(state: State, answer: Answer, right: Equilibrium | None, fine: Arm) 
         return Outcome.RIGHT if not isinstance(answer.guess, Equilibrium) or answer.guess.stable else Outcome.UNSTABLE
     try:
         near = shape(state, answer)
-        found = reference(state, near)
+        found = reference(state, near, CONFIRMED)
         strain = near.sample(fine.node_arc)[1]
         stability = smallest_eigenvalue(fine.model, strain, near.tensions, state.drive, state.load)
     except (NoReference, ArithmeticError, ValueError, np.linalg.LinAlgError):
         return Outcome.WRONG
     if found.moved > FARTHEST * state.arm.length:
         return Outcome.WRONG
-    return Outcome.OTHER if stability > 0.0 else Outcome.UNSTABLE
+    if stability <= 0.0:
+        return Outcome.UNSTABLE
+    inaccurate = right is not None and apart(state.arm, found.tip, right.tip_pose) <= NEAR
+    return Outcome.RIGHT if inaccurate else Outcome.OTHER
 
 
 def apart(arm: Arm, tip: Array, other: Array) -> float:
