@@ -40,7 +40,9 @@ MAX_SUBSTEPS = 16
 FIRST_SUBSTEP, SMALLEST_SUBSTEP = 0.25, 1.0 / 32.0
 BALANCED = 1e-9
 """A section is balanced after a Newton step that changes its strain, times L for curvatures, by less."""
-MAX_SECTION_STEPS = 15
+LONGEST_SECTION_STEP = 1.0
+"""By no more than this does a Newton step change it: muscles that push make the balance nonlinear."""
+MAX_SECTION_STEPS = 30
 ORIGIN = (0.0, 0.0, 0.0)
 ROTATION, MOMENT = 4, 3
 
@@ -136,7 +138,9 @@ def _balance(model, k, x, strain, tension, body, section, wrench, norm):
         change = 0.0
         for d in range(6):
             change = max(change, abs(step[d]) * (length if d < 3 else 1.0))
-            strain[d] += step[d]
+        part = min(1.0, LONGEST_SECTION_STEP / max(change, 1e-300))
+        for d in range(6):
+            strain[d] += part * step[d]
         if change < BALANCED:
             return True
     return False
