@@ -289,7 +289,6 @@ COLOURS = {
     Outcome.NOTHING: "#444444",
 }
 """Told apart by the colour-blind, and in grey by their lightness."""
-NO_TRUTH = "#ffffff"
 
 
 def draw_maps(results: Sequence[Result], families: Sequence[Family], path: Path) -> None:
@@ -381,7 +380,7 @@ def draw_rates(results: Sequence[Result], path: Path) -> None:
     right.grid(visible=False)
     for axes in (left, right):
         axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False, fontsize=8.5, columnspacing=1.2)
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False, fontsize=8, columnspacing=1.0)
     output.save_figure(figure, path)
 
 

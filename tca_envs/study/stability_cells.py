@@ -152,7 +152,7 @@ def tension_force(count: int) -> Family:
     arm = rod(ROD_LENGTH)
     values = [(t, f) for t in np.linspace(0.0, TENSION, count).tolist() for f in np.linspace(0.0, FORCE, count).tolist()]
     cells = [Cell(t, f, Case(None, State(arm, np.array([t]), (0.0, f, 0.0)))) for t, f in values]
-    return Family("tension-force", "cold start\nrod of 45 mm", "tension [N]", "tip force [N]", tuple(cells))
+    return Family("tension-force", "cold start,\nrod of 45 mm", "tension [N]", "tip force [N]", tuple(cells))
 
 
 def length_tension(count: int) -> Family:
@@ -184,7 +184,7 @@ def cold_tilt(count: int) -> Family:
         arm = tilted(tilt)
         for t in every(TEMPERATURES, count):
             cells.append(Cell(tilt, t, Case(None, State(arm, np.array([AMBIENT, t, t])))))
-    title = "cold start\n4.5 mm arm,\ntwo TCAs hot"
+    title = "cold start,\n4.5 mm arm,\ntwo TCAs hot"
     return Family("cold-tilt", title, "gravity, from down to up [deg]", "TCAs [°C]", tuple(cells))
 
 
@@ -196,7 +196,7 @@ def step_tilt(count: int) -> Family:
         before = State(arm, np.full(3, AMBIENT))
         for step in every(STEPS, count):
             cells.append(Cell(tilt, step, Case(before, State(arm, np.array([AMBIENT + step, AMBIENT, AMBIENT])))))
-    title = "step from 25 °C\n4.5 mm arm,\none TCA"
+    title = "step from 25 °C,\n4.5 mm arm,\none TCA"
     return Family("step-tilt", title, "gravity, from down to up [deg]", "step [K]", tuple(cells))
 
 
