@@ -137,40 +137,38 @@ def climb(arm: "Arm", start: Lane, stuck: Lane, drive: Array, load: Array, deadl
     if here.reached:
         return end(SUBSTEPS, arm, here, False)
     reasons.append(f"substeps end at {gone(here.lane)}")
-    if not late():
-        finer = arm.finer
-        fine = _follow(finer.model, arm.on(finer, here.lane), drive, load, deadline)
-        iterations += fine.iterations
-        if fine.reached:
-            back = finer.on(arm, fine.lane)
-            own = _follow(arm.model._replace(ladder=False), back, drive, load, deadline)
-            iterations += own.iterations
-            if own.reached and np.linalg.norm(own.tip[:3, 3] - fine.tip[:3, 3]) < SAME * arm.length:
-                return end(FINER, arm, own, False)
-            return end(FINER, finer, fine, False)
-        reasons.append(f"those on a finer grid at {gone(fine.lane)}")
-    jumped = False
+    # Where a branch ends, a grid's error decides on much: from here on with less of it.
+    finer, rung, jumped = arm.finer, FINER, False
+    here = _follow(finer.model, arm.on(finer, here.lane), drive, load, deadline)
+    iterations += here.iterations
+    if not here.reached:
+        rung = DESCENT
+        reasons.append(f"those on a finer grid at {gone(here.lane)}")
     for fall in range(MAX_FALLS):
-        if late():
+        if here.reached or late():
             break
         begun, share = here.lane, min(1.0, PAST * 2.0**fall)
         past = (begun.drive + share * (drive - begun.drive), begun.load + share * (load - begun.load))
-        fallen, steps = descend(arm.model, begun, *past, late)
+        fallen, steps = descend(finer.model, begun, *past, late)
         iterations += steps
         if fallen is None:
             reasons.append(f"the fall from {gone(begun)} finds no equilibrium")
             break
-        back = _follow(arm.model, fallen, begun.drive, begun.load, deadline)
-        jump = not (back.reached and _alike(arm.model, back.lane, begun))
+        again = _follow(finer.model, fallen, begun.drive, begun.load, deadline)
+        jump = not (again.reached and _alike(finer.model, again.lane, begun))
         jumped |= jump
         reasons.append(f"{'fell' if jump else 'went down'} at {gone(begun)}")
-        here = _follow(arm.model, fallen, drive, load, deadline)
-        iterations += back.iterations + here.iterations
-        if here.reached:
-            return end(DESCENT, arm, here, jumped)
-    if late():
-        reasons.append("the time limit is reached")
-    return end(FAILED, arm, here, False)
+        here = _follow(finer.model, fallen, drive, load, deadline)
+        iterations += again.iterations + here.iterations
+    if not here.reached:
+        if late():
+            reasons.append("the time limit is reached")
+        return end(FAILED, finer, here, False)
+    own = _follow(arm.model._replace(ladder=False), finer.on(arm, here.lane), drive, load, deadline)
+    iterations += own.iterations
+    if own.reached and np.linalg.norm(own.tip[:3, 3] - here.tip[:3, 3]) < SAME * arm.length:
+        return end(rung, arm, own, jumped)
+    return end(rung, finer, here, jumped)
 
 
 def solve(
