@@ -825,6 +825,26 @@ def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip,
     _solve_lanes(*model, strain, tension, from_drive, from_load, drive, load, budget(model), tip, lengths, report)
 
 
+def compile_kernels(model, lane):
+    """Compile the kernels if need be, or load them from the cache, so that this is no part of the time of a solve.
+
+    Parameters
+    ----------
+    model : Model
+        Of any arm.
+    lane : tuple of array
+        One of its states: strain (G, 6), tension (n,), drive (n,), load (LOAD,).
+    """
+    if linearise.signatures and _solve_lanes.signatures:
+        return
+    strain, tension, drive, load = (values.copy() for values in lane)
+    linearise(model, strain, tension, drive, load, 0.0, False, SHAPE, strain)
+    solve_lanes(
+        model, strain[np.newaxis], tension[np.newaxis], drive[np.newaxis], load[np.newaxis], drive[np.newaxis].copy(),
+        load[np.newaxis].copy(), np.zeros((1, 4, 4)), np.zeros((1, drive.size)), np.zeros((1, REPORT)),
+    )  # fmt: skip
+
+
 def budget(model):
     """Return the Newton iterations after which `solve_lanes` gives a lane up, so that someone can look at the clock."""
     return max(MAX_ITERATIONS, WORK // len(model.mass_below))
@@ -916,7 +936,7 @@ def linearise(model, strain, tension, drive, load, damping, slaved, ask, given):
     n = tension.size
     numbers = np.zeros(9)
     columns = n if ask == JACOBIAN else (1 if ask >= STEP else 0)
-    tips = np.zeros((6, max(columns, 1)))
+    tips = np.zeros((6, columns))
     worst = total = np.inf
     for again in range(2 if slaved else 1):
         worst, total = evaluate(model, strain, tension, drive, load, again > 0, ws)
