@@ -210,9 +210,9 @@ class Fine(NamedTuple):
     cells: tuple[int, ...]
 
     @classmethod
-    def over(cls, arm: Arm) -> "Fine":
+    def over(cls, arm: Arm, finer: int = 1) -> "Fine":
         waves = [max([abs(muscle.turns) for muscle in module.muscles] + [1.0]) for module in arm.modules]
-        return cls(arm, tuple(2 * int(np.ceil(12.0 * wave)) for wave in waves))
+        return cls(arm, tuple(2 * finer * int(np.ceil(12.0 * wave)) for wave in waves))
 
     def points(self) -> list[Array]:
         """Arc positions (2 N,) of the Gauss points in each module, from its own base [m]."""
@@ -411,7 +411,7 @@ def local(scene: Scene, result: Equilibrium) -> tuple[Local, float]:
 def test_an_equilibrium_is_a_minimum_of_the_energy(count):
     """Nothing that the arm does in a small neighbourhood lowers its energy, wherever it came from.
 
-    The grids of the test and of the solver differ by up to 1e-6 of the strain: so large is the slope that remains.
+    The errors of the grids of the test and of the solver leave a slope, of 1e-5 at most in a thousand arms.
     """
 
     @settings(same, max_examples=count)
@@ -421,8 +421,8 @@ def test_an_equilibrium_is_a_minimum_of_the_energy(count):
         assume(result.converged)
         here, unit = local(scene, result)
         size = np.sqrt(np.diag(here.metric))
-        assert (np.abs(here.slope) < 1e-5 * size * np.sqrt(unit)).all()
-        assert here.fall < 1e-5 * STEP * 2.0 * size.max() * np.sqrt(unit)
+        assert (np.abs(here.slope) < 1e-4 * size * np.sqrt(unit)).all()
+        assert here.fall < 1e-4 * STEP * 2.0 * size.max() * np.sqrt(unit)
         assert 0.0 < result.stability < 1.01 * here.softest() + 1e-4
 
     check()
@@ -442,7 +442,7 @@ def test_rod_and_muscles_carry_the_loads(count):
         result = scene.solve(FINER)
         assume(result.converged)
         arm = scene.arm(FINER)
-        grid = Fine.over(arm)
+        grid = Fine.over(arm, 2)
         strain = [x[np.newaxis] for x in grid.sampled(result)]
         shapes = grid.shape(strain)
         rotation, position = (shapes[-1][k][0, -1] for k in (0, 1))
@@ -810,11 +810,14 @@ def test_two_hot_muscles_of_a_hanging_arm_have_two_answers():
     assert back[10, 1] - there[10, 1] == pytest.approx(2.0 * 1.63e-3, abs=0.02e-3)
 
 
-def test_a_short_time_limit_ends_a_solve_early():
-    """A long soft arm thrown over: it would take its time."""
-    modules = [Module.cylinder(0.1, 2.0 * RADIUS, E, E / 3.0, 4e-3, [Muscle(0.004, a, 1.0, TCA()) for a in (0.0, 2.0)])] * 4
-    arm = Arm(modules, (0.0, 0.0, -G0), Payload(5e-3))
-    begin = perf_counter()
-    result = arm.equilibrium([120.0] * 8, time_limit_s=1e-3)
-    assert perf_counter() - begin < 0.25
-    assert result.converged or "time" in result.message
+def test_a_solve_keeps_its_time_limit():
+    """A long soft arm that falls over takes seconds; given less, it says so."""
+    muscles = [Muscle(0.004, angle, 1.0, TCA()) for angle in (0.0, 2.0)]
+    arm = Arm([replace(column(0.1, 4e-3), muscles=muscles)] * 4, (0.0, 0.0, -G0), Payload(5e-3))
+    arm.equilibrium([120.0] * 8, (0.5, 0.0, 0.0))  # compiles
+    for limit in (1e-3, 0.2):
+        begin = perf_counter()
+        result = arm.equilibrium([120.0] * 8, time_limit_s=limit)
+        assert perf_counter() - begin < limit + 0.5
+        assert not result.converged
+        assert "time limit" in result.message
