@@ -422,15 +422,15 @@ class Arm:
         """
         drive = self.checked_drive(drive)
         load = self.load(tip_force, tip_moment, payload)
-        time_limit_s = check.scalar("time_limit_s", time_limit_s, 0.0, above=True)
+        if time_limit_s is not TIME_LIMIT_S:
+            time_limit_s = check.scalar("time_limit_s", time_limit_s, 0.0, above=True)
         lane = Lane(*(self.unloaded() if start is None else self.restart(start)))
         tip, lengths, report = EYE.copy(), np.empty((1, drive.size)), np.empty((1, REPORT))
         asked = (drive[np.newaxis], load[np.newaxis])
         on, message = self, ""
         if not (self.unstressed(load) and self._closed_form(lane, *asked, tip, lengths, report)):
-            compile_kernels(self.model, lane)
-            begun, here = time.perf_counter(), lane
-            lane = Lane(*(values.copy() for values in here))
+            compile_kernels()
+            begun, here, lane = time.perf_counter(), lane, Lane(*(values.copy() for values in lane))
             known = Lane(*(values[np.newaxis] for values in lane))
             solve_lanes(self.model, *known, *asked, tip, lengths, report)
             if report[0, 0] == FAILED:

@@ -187,7 +187,7 @@ def solve(
     Arguments as of `collocation.solve_lanes`; lanes without an answer are left as they were. An answer on a finer grid is
     carried to the arm's own.
     """
-    compile_kernels(arm.model, (strain[0], tension[0], from_drive[0], from_load[0]))
+    compile_kernels()
     start = (strain.copy(), tension.copy(), from_drive.copy(), from_load.copy())
     lanes = (strain, tension, from_drive, from_load)
     solve_lanes(arm.model, *lanes, drive, load, tip, lengths, report)
