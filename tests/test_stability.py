@@ -659,8 +659,11 @@ def switch(stands: Callable[[float], bool], low: float, high: float) -> float:
 
 
 def stands(result: Equilibrium) -> bool:
-    """Whether the rod is straight. Where it cannot stand so, it has buckled: it is never returned straight and unstable."""
-    assert result.converged and result.stability > 0.0
+    """Whether the rod is straight. Where it cannot stand so, it has buckled: it is never returned straight and unstable.
+
+    It bends little just above the critical load, and unbends below: the arm leaves its branch, but does not jump.
+    """
+    assert result.converged and result.stability > 0.0 and not result.jumped
     assert straight(result) or result.rung == Rung.DESCENT
     return straight(result)
 
