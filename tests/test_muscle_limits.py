@@ -197,7 +197,7 @@ def test_the_rod_collapses_under_a_straight_tendon_at_the_closed_form_tension():
     for start in (None, near):
         beyond = arm.equilibrium([1.001 * critical], start=start)
         assert not beyond.converged
-        assert "no equilibrium" in beyond.message and "collapses the rod" in beyond.message
+        assert beyond.message.startswith("no equilibrium found: ") and "collapses the rod" in beyond.message
         shape = near.tip_pose if start else np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, L], [0, 0, 0, 1.0]])
         assert beyond.tip_pose == pytest.approx(shape, abs=1e-9)
         assert np.isfinite(beyond.poses([0.0, 0.3 * L, L])).all()
