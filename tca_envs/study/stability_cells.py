@@ -309,7 +309,7 @@ class Referee:
         for stride, finer in ((STRIDE, 1.0), (0.5 * STRIDE, 1.5)):
             before = None if case.before is None else self._walk(case.before, stride, finer)
             if before is not None and before.found is None:
-                return Truth(None, None, before.jumps, f"where the step starts: {before.lost}", "")
+                return Truth(None, None, before.jumps, f"where the step starts: {before.lost}", _uncollapsed(before))
             befores.append(before.found if before is not None else None)
             ends.append(follow(case.state, befores[-1], stride, finer))
         return Truth(befores[1], *ends[1], doubt(case.state, *ends))
@@ -320,7 +320,7 @@ def doubt(state: State, one: Walk, other: Walk) -> str:
     if one.found is None or other.found is None:
         if one.found is not other.found:
             return "only one of two slow changes finds an equilibrium"
-        return "" if other.lost == COLLAPSE else f"no equilibrium, though nothing collapses: {other.lost}"
+        return _uncollapsed(other)
     apart = float(np.linalg.norm(one.found.tip_pose[:3, 3] - other.found.tip_pose[:3, 3])) / state.arm.length
     if apart > AGREE:
         return f"slow changes end {apart:.1%} of the length apart"
@@ -329,3 +329,7 @@ def doubt(state: State, one: Walk, other: Walk) -> str:
     except NoReference as reason:
         return f"not confirmed: {reason}"
     return "" if moved < AGREE else f"confirmed {moved:.1%} of the length away"
+
+
+def _uncollapsed(walk: Walk) -> str:
+    return "" if walk.lost == COLLAPSE else f"no equilibrium, though nothing collapses: {walk.lost}"

@@ -40,9 +40,9 @@ MAX_SUBSTEPS = 16
 FIRST_SUBSTEP, SMALLEST_SUBSTEP = 0.25, 1.0 / 32.0
 BALANCED = 1e-9
 """A section is balanced after a Newton step that changes its strain, times L for curvatures, by less."""
-LONGEST_SECTION_STEP = 1.0
-"""By no more than this does a Newton step change it: muscles that push make the balance nonlinear."""
-MAX_SECTION_STEPS = 30
+CAREFUL = 1.0
+"""Where that fails, steps change it by no more than this: muscles that push make the balance very nonlinear."""
+MAX_SECTION_STEPS = 60
 ORIGIN = (0.0, 0.0, 0.0)
 ROTATION, MOMENT = 4, 3
 
@@ -87,10 +87,11 @@ def _muscles(model, k, x, u, v, wrench, norm):
 
 
 @inner
-def _balance(model, k, x, strain, tension, body, section, wrench, norm):
+def _balance(model, k, x, strain, tension, body, longest, section, wrench, norm):
     """Solve the section of module k at x for its strain (6,), in place, under the wrench `body` (6,).
 
-    Leaves the Cholesky factor of its derivative in `section` (lower half); False where there is no answer.
+    No step changes it by more than `longest`. Leaves the Cholesky factor of the balance's derivative in `section` (lower
+    half); False where there is no answer.
     """
     stiffness, length = model.stiffness[k], model.length[k]
     i0, muscles = model.first_muscle[k], model.first_muscle[k + 1] - model.first_muscle[k]
@@ -138,7 +139,7 @@ def _balance(model, k, x, strain, tension, body, section, wrench, norm):
         change = 0.0
         for d in range(6):
             change = max(change, abs(step[d]) * (length if d < 3 else 1.0))
-        part = min(1.0, LONGEST_SECTION_STEP / max(change, 1e-300))
+        part = min(1.0, longest / max(change, 1e-300))
         for d in range(6):
             strain[d] += part * step[d]
         if change < BALANCED:
@@ -205,10 +206,14 @@ def rates(model, x, y, tension, load, strain, warm, rate, tangent, by_state, by_
             here = strain[j, k]
             if not warm:
                 here[:] = strain[j - 1, k] if j > 0 else model.reference[k]
-            balanced = _balance(model, k, x[j], here, tension, body, section, wrench, norm)
-            if not balanced:
-                here[:] = model.reference[k]
-                balanced = _balance(model, k, x[j], here, tension, body, section, wrench, norm)
+            balanced = False
+            for attempt in range(3):
+                if attempt > 0:
+                    here[:] = model.reference[k]
+                longest = np.inf if attempt < 2 else CAREFUL
+                balanced = _balance(model, k, x[j], here, tension, body, longest, section, wrench, norm)
+                if balanced:
+                    break
             if not balanced:
                 here[:] = model.reference[k]
                 rate[:, j] = np.nan
