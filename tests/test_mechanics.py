@@ -613,7 +613,8 @@ HOT = [
 @pytest.mark.parametrize("drive", HOT)
 def test_a_refined_grid_moves_the_tip_less_than_a_micrometre(drive):
     coarse = paper_module([Grid(1, 8)]).equilibrium(drive)
-    fine = paper_module([Grid(10, 8)]).equilibrium(drive)
+    # To the same side, where a symmetric arm buckles.
+    fine = paper_module([Grid(10, 8)]).equilibrium(drive, start=coarse)
     assert coarse.converged and fine.converged
     assert np.linalg.norm(coarse.tip_pose[:3, 3] - fine.tip_pose[:3, 3]) < 1e-6
 

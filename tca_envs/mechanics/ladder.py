@@ -21,7 +21,6 @@ from tca_envs.mechanics.collocation import (
     INERTIA,
     NEUTRAL,
     REPORT,
-    SHAPE,
     SMALLEST_SUBSTEP,
     STEP,
     SUBSTEPS,
@@ -50,12 +49,14 @@ MAX_DESCENT = 300
 FALL_STEP = 0.3
 """Largest rotation [rad] and change of v in a step of a fall: it stays close to the way of the real, strongly damped arm."""
 FIRST_DAMPING = 0.1
+EASING = 0.2
+"""The damping falls by this factor after a step that went as predicted."""
 MOST_DAMPING = 1e8
 COLLAPSED = 0.01
 """A muscle's path that is shorter, per length of the rod, is about to become a point; there is no tangent then."""
 NUDGE = 0.02
 """An arm that stands on an unstable equilibrium is pushed off it by this rotation [rad], unless it moves as much by itself."""
-MODE_ITERATIONS = 12
+MODE_ITERATIONS = 6
 FLAT = 1e-5
 """Differences of energy below this, over EI/L, do not tell up from down, as the grid's error may be as large; the gradient
 does."""
@@ -269,40 +270,43 @@ def descend(model: Model, lane: Lane, drive: Array, load: Array, late: Callable[
     tuple
         The equilibrium, None where none was found; steps.
     """
-    strain, tension, damping = lane.strain.copy(), lane.tension.copy(), FIRST_DAMPING
     # Just beyond a fold the imbalance is small, too, where the equilibrium has been.
     end = min(model.tolerance, max(1e-3 * model.tolerance, 1e-10))
     flat = FLAT * float((model.stiffness[:, :3].min(axis=1) / model.length).min())
-    for step in range(MAX_DESCENT):
-        if late():
-            return None, step
+
+    def look(strain: Array, tension: Array, damping: float) -> tuple[Array, Array, Array]:
+        """Return the numbers of `linearise`, the step and the tip's turn; `tension` is overwritten with what follows."""
         numbers, *_, bend, shear, tips = linearise(model, strain, tension, drive, load, damping, True, STEP, strain)
+        return numbers, np.hstack([bend, shear]), tips[3:, 0]
+
+    strain, tension, damping = lane.strain.copy(), lane.tension.copy(), FIRST_DAMPING
+    numbers, way, turn = look(strain, tension, damping)
+    for step in range(MAX_DESCENT):
         residual, _, energy, index, _, rotation, slide, slope, size = numbers.tolist()
-        if not residual < np.inf:
+        if not residual < np.inf or damping > MOST_DAMPING or late():
             return None, step
         if residual < end:
             if negative_eigenvalues(model, strain, tension, drive, load, NEUTRAL) == 0:
                 return Lane(strain, tension, drive, load), step
             if not index and rotation < NUDGE:
                 strain = _pushed_off(model, strain, tension, drive, load)
+                numbers, way, turn = look(strain, tension, damping)
                 continue
-        if index or not np.isfinite(rotation):
-            damping = max(4.0 * damping, 1e-3)
-            if damping > MOST_DAMPING:
-                return None, step
-            continue
-        share = min(1.0, FALL_STEP / max(rotation, 1e-300), FALL_STEP / max(slide, 1e-300))
-        trial, pull = strain + share * np.hstack([bend, shear]), tension.copy()
-        there = linearise(model, trial, pull, drive, load, 0.0, True, SHAPE, trial)[0]
-        predicted = -share * slope + 0.5 * share**2 * (slope + damping * size)
-        gained = energy - there[2] + share * float(load[3:6] @ tips[3:, 0])
-        level = abs(gained) < flat and predicted < flat
-        if gained > 0.1 * predicted or level:
-            strain, tension = trial, pull
-        if gained > 0.5 * predicted or level:
-            damping *= 0.25
-        elif not gained > 0.25 * predicted:
-            damping = max(4.0 * damping, 1e-3)
+        if not index and np.isfinite(rotation):
+            share = min(1.0, FALL_STEP / max(rotation, 1e-300), FALL_STEP / max(slide, 1e-300))
+            trial, pull = strain + share * way, tension.copy()
+            there = look(trial, pull, EASING * damping)
+            predicted = -share * slope + 0.5 * share**2 * (slope + damping * size)
+            gained = energy - there[0][2] + share * float(load[3:6] @ turn)
+            level = abs(gained) < flat and predicted < flat
+            if gained > 0.5 * predicted or level:
+                strain, tension, damping = trial, pull, EASING * damping
+                numbers, way, turn = there
+                continue
+            if gained > 0.1 * predicted:
+                strain, tension = trial, pull
+        damping = max(4.0 * damping, 1e-3)
+        numbers, way, turn = look(strain, tension, damping)
     return None, MAX_DESCENT
 
 
