@@ -154,5 +154,7 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
                 "converged": bool(solved(report)),
                 "residual": float(report[1]),
                 "iterations": int(report[2]),
+                "rung": int(report[0]),
+                "jumped": bool(report[3]),
             },
         }

@@ -13,7 +13,7 @@ from scipy.stats import spearmanr
 
 from tca_envs import presets
 from tca_envs.mechanics import Arm, Grid, shooting
-from tca_envs.mechanics.collocation import solve_lanes
+from tca_envs.mechanics.collocation import REPORT, solve_lanes
 from tca_envs.mechanics.discretisation import cost
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
 from tca_envs.tasks.core import CUT_OFF
@@ -108,7 +108,7 @@ def test_the_counted_cost_of_a_grid_follows_the_measured_time():
     grids = [Grid(1, 4), Grid(1, 6), Grid(1, 8), Grid(1, 10), Grid(1, 14), Grid(2, 6), Grid(4, 4), Grid(3, 8)]
     arms = [Arm([module], presets.GRAVITY, presets.BELOW_BENDING, [grid], 1e-5) for grid in grids]
     known = [arm.equilibrium(WARM) for arm in arms]
-    asked, tip, report = np.tile(WARM + 1.0, (lanes, 1)), np.tile(np.eye(4), (lanes, 1, 1)), np.empty((lanes, 3))
+    asked, tip, report = np.tile(WARM + 1.0, (lanes, 1)), np.tile(np.eye(4), (lanes, 1, 1)), np.empty((lanes, REPORT))
     taken = np.empty((40, len(arms)))
     for row in taken:
         for j, (arm, start) in enumerate(zip(arms, known, strict=True)):

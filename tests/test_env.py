@@ -252,13 +252,13 @@ def test_a_failed_solve_keeps_the_last_good_state_and_truncates(env, monkeypatch
     before = unwrapped.get_state()
     observation = unwrapped._observe()
 
-    def without_answer(model, strain, tension, *rest):
-        rest[-1][:] = (collocation.FAILED, 1.0, 7)
+    def without_answer(arm, strain, tension, *rest):
+        rest[-1][:] = (collocation.FAILED, 1.0, 7, 0)
 
-    monkeypatch.setattr(core, "solve_lanes", without_answer)
+    monkeypatch.setattr(core.ladder, "solve", without_answer)
     after, reward, terminated, truncated, info = unwrapped.step(np.ones(env.action_space.shape, np.float32))
     assert (terminated, truncated) == (False, True)
-    assert info["solver"] == {"converged": False, "residual": 1.0, "iterations": 7}
+    assert info["solver"] == {"converged": False, "residual": 1.0, "iterations": 7, "rung": collocation.FAILED, "jumped": False}
     assert np.isfinite(reward)
     for key in observation:
         assert observation[key].tobytes() == after[key].tobytes()

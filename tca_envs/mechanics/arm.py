@@ -1,8 +1,9 @@
 """The arm as data: muscles in modules, modules in series, what hangs from the tip; and its equilibrium."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from math import ceil, hypot
 from operator import index as as_integer
 from typing import NamedTuple
@@ -10,27 +11,37 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tca_envs.mechanics import check, closed_form, section
-from tca_envs.mechanics.closed_form import CLOSED_FORM
+from tca_envs.mechanics import check, closed_form, ladder, section
 from tca_envs.mechanics.collocation import (
+    CLOSED_FORM,
+    DESCENT,
     FAILED,
-    FALL,
+    FINER,
+    JACOBIAN,
     LOAD,
     PAYLOAD_MASS,
+    REPORT,
+    SHAPE,
     SUBSTEPS,
     WARM,
     Model,
-    shape,
+    linearise,
     solve_lanes,
-    tip_jacobian,
 )
-from tca_envs.mechanics.equilibrium import Equilibrium
+from tca_envs.mechanics.equilibrium import Equilibrium, Rung
+from tca_envs.mechanics.ladder import TIME_LIMIT_S, Lane
 from tca_envs.mechanics.muscle import PARAMETERS, Muscle
 
 Array = NDArray[np.float64]
 ArrayOf3 = tuple[float, float, float]
 ZERO: ArrayOf3 = (0.0, 0.0, 0.0)
 EYE = np.eye(4)[np.newaxis]
+RUNGS = {
+    SUBSTEPS: "substeps in drive and load",
+    FINER: "substeps on a finer grid",
+    DESCENT: "a fall from the end of the start's branch",
+    CLOSED_FORM: "closed form, for nothing loads the arm",
+}
 STRAIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -323,14 +334,7 @@ class Arm:
         self.discretisation = Discretisation(self.grids, self.residual_tolerance, self.sections is not None)
         ranges = [muscle.law.drive_range() for muscle in self.muscles]
         self._lowest, self._highest = [low for low, _ in ranges], [high for _, high in ranges]
-        found = f"converged below {self.residual_tolerance:g}"
-        self._messages = {
-            WARM: found,
-            SUBSTEPS: f"{found} in substeps of drive and load",
-            FALL: f"{found} after a fall from the end of the start's branch",
-            CLOSED_FORM: "closed form: nothing loads the arm",
-            FAILED: "no equilibrium found by Newton, substeps or a damped fall; this is the start's shape",
-        }
+        self._found = f"converged below {self.residual_tolerance:g}"
         self._neutral = np.array(
             [m.law.neutral_drive(rest) for m, rest in zip(self.muscles, self.model.rest_length, strict=True)]
         )
@@ -345,6 +349,16 @@ class Arm:
     def rest_lengths(self) -> Array:
         """Path lengths of the muscles in the unloaded arm (n,) [m]."""
         return self.model.rest_length.copy()
+
+    @cached_property
+    def finer(self) -> "Arm":
+        """The same arm with twice the elements."""
+        grids = [Grid(2 * elements, nodes) for elements, nodes in self.grids]
+        return Arm(self.modules, self.gravity, self.payload, grids, self.residual_tolerance)
+
+    def on(self, other: "Arm", lane: Lane) -> Lane:
+        """Return an equilibrium of this arm on the grids of another one with the same modules."""
+        return lane._replace(strain=carried(self.grids, lane.strain, other.grids))
 
     def load(self, tip_force: ArrayLike = ZERO, tip_moment: ArrayLike = ZERO, payload: Payload | None = None) -> Array:
         """Return the external load as the flat array of `collocation.LOAD` numbers that the kernels read."""
@@ -372,8 +386,9 @@ class Arm:
         tip_moment: ArrayLike = ZERO,
         start: Equilibrium | None = None,
         payload: Payload | None = None,
+        time_limit_s: float = TIME_LIMIT_S,
     ) -> Equilibrium:
-        """Find the equilibrium that continues `start`, or the unloaded arm.
+        """Find the stable equilibrium to which slow heating and loading take the arm from `start`, or from the unloaded arm.
 
         Parameters
         ----------
@@ -385,11 +400,13 @@ class Arm:
             An earlier equilibrium of this arm: a warm start.
         payload : Payload, optional
             What hangs from the tip instead of the arm's own payload.
+        time_limit_s : float
+            A solve that takes longer is given up [s].
 
         Returns
         -------
         Equilibrium
-            With `converged` False, and the start's shape, where none was found.
+            Stable; with `converged` False, and the start's shape, where none was found.
 
         Raises
         ------
@@ -399,45 +416,74 @@ class Arm:
 
         Notes
         -----
-        Gauss collocation of the strain with Newton, then substeps in drive and load, then a damped fall; see
-        `collocation`.
+        Gauss collocation of the strain, by a ladder: Newton straight from the start, its first step the tangent's prediction;
+        then substeps in drive and load; then those on a finer grid; then, where the branch ends, the fall down the hill of the
+        total energy, and on from there. See `collocation.newton`, `collocation.solve` and `ladder`.
         """
+        begun = time.perf_counter()
         drive = self.checked_drive(drive)
         load = self.load(tip_force, tip_moment, payload)
-        if start is None:
-            strain, tension, from_drive, from_load = self.unloaded()
-        else:
-            strain, tension, from_drive, from_load = self.restart(start)
-        tip, lengths, report = EYE.copy(), np.empty((1, drive.size)), np.empty((1, 3))
-        lane = (
-            strain[np.newaxis], tension[np.newaxis], from_drive[np.newaxis], from_load[np.newaxis],
-            drive[np.newaxis], load[np.newaxis], tip, lengths, report,
-        )  # fmt: skip
-        if not (self.unstressed(load) and closed_form.solve_lane(self.model, self.sections, *lane)):
-            solve_lanes(self.model, *lane)
-        rung, residual, iterations = report[0].tolist()
-        converged = rung != FAILED
-        if not converged:
-            ends, _, position, _, _, lengths[0] = shape(self.model, strain, tension, from_drive, from_load)
+        time_limit_s = check.scalar("time_limit_s", time_limit_s, 0.0, above=True)
+        lane = Lane(*(self.unloaded() if start is None else self.restart(start)))
+        tip, lengths, report = EYE.copy(), np.empty((1, drive.size)), np.empty((1, REPORT))
+        asked = (drive[np.newaxis], load[np.newaxis])
+        on, message = self, ""
+        if not (self.unstressed(load) and self._closed_form(lane, *asked, tip, lengths, report)):
+            here = lane
+            lane = Lane(*(values.copy() for values in here))
+            solve_lanes(self.model, *(values[np.newaxis] for values in lane), *asked, tip, lengths, report)
+            if report[0, 0] == FAILED:
+                climbed = ladder.climb(self, here, lane, drive, load, begun + time_limit_s)
+                message, on, lane = climbed.message, climbed.arm, climbed.lane
+                tip[0], lengths[0], iterations = climbed.tip, climbed.lengths, report[0, 2] + climbed.iterations
+                report[0] = climbed.rung, climbed.residual, iterations, climbed.jumped
+        rung, residual, iterations, jumped = report[0].tolist()
+        if rung == FAILED:
+            on, lane = self, here
+            ends, _, position, _, _, lengths[0] = on.shape(lane)
             tip[0] = pose(ends[-1], position[-1])
-        # Where there is no answer, from_drive and from_load still are the start's.
-        state = _Shape(self, strain, tension, from_drive, from_load)
+            message = f"no equilibrium found: Newton does not go straight to one; {message}; this is the start's shape"
+        elif rung == WARM:
+            message = self._found
+        else:
+            message = "; ".join([f"{self._found} by {RUNGS[rung]}", *filter(None, [message])])
+        state = _Shape(on, lane)
         return Equilibrium(
             tip_pose=tip[0],
-            tensions=tension,
+            tensions=lane.tension,
             muscle_lengths=lengths[0],
             drive=drive,
-            converged=converged,
+            converged=rung != FAILED,
+            rung=Rung(int(rung)),
+            jumped=bool(jumped),
             residual=residual,
             iterations=int(iterations),
-            message=self._messages[int(rung)],
+            message=message,
             length=self.length,
             load=load,
-            known=(from_drive, from_load),
+            known=(lane.drive, lane.load),
             sample=state.sample,
             differentiate=state.differentiate,
-            nodes=(self.model, strain),
+            certify=state.certify,
+            nodes=(on.model, lane.strain),
         )
+
+    def _closed_form(self, lane: Lane, drive: Array, load: Array, tip: Array, lengths: Array, report: Array) -> bool:
+        """Solve in closed form, in place; False where that is no answer, or where the lane is left as it was."""
+        found = tuple(values[np.newaxis].copy() for values in lane)
+        if not closed_form.solve_lane(self.model, self.sections, *found, drive, load, tip, lengths, report):
+            return False
+        # The energy is convex where nothing pushes.
+        if (found[1] < 0.0).any() and ladder.negative_eigenvalues(self.model, *(values[0] for values in found)):
+            return False
+        for values, new in zip(lane, found, strict=True):
+            values[...] = new[0]
+        return True
+
+    def shape(self, lane: Lane) -> tuple[Array, ...]:
+        """Return quaternions at elements' ends and nodes, positions at ends [m], p' and p' x n at nodes, path lengths [m]."""
+        strain, tension, drive, load = lane
+        return linearise(self.model, strain, tension.copy(), drive, load, 0.0, False, SHAPE, strain)[1:7]
 
     def checked_drive(self, drive: ArrayLike) -> Array:
         """Return `drive` as (n,) floats; ValueError for a wrong shape, non-finite numbers or values out of a law's range."""
@@ -482,24 +528,27 @@ class _Shape(NamedTuple):
     """A known equilibrium, and what follows from it where it is asked for."""
 
     arm: Arm
-    strain: Array
-    tension: Array
-    drive: Array
-    load: Array
+    lane: Lane
 
     def differentiate(self) -> Array:
         """Return d tip/d drive (6, n)."""
-        return tip_jacobian(self.arm.model, self.strain, self.tension.copy(), self.drive, self.load)
+        strain, tension, drive, load = self.lane
+        return linearise(self.arm.model, strain, tension.copy(), drive, load, 0.0, False, JACOBIAN, strain)[-1]
+
+    def certify(self) -> float:
+        """Return the smallest eigenvalue of the tangent."""
+        return ladder.smallest_eigenvalue(self.arm.model, *self.lane)
 
     def sample(self, s: Array) -> tuple[Array, Array]:
         """Return poses and strains at `s`: collocation polynomials for pose and moment, section balance for the strain."""
         arm, model = self.arm, self.arm.model
-        ends, quaternion, position, tangent, spin, _ = shape(model, self.strain, self.tension.copy(), self.drive, self.load)
+        strain, tension, _, load = self.lane
+        ends, quaternion, position, tangent, spin, _ = arm.shape(self.lane)
         rotation = pose(ends[-1], position[-1])[:3, :3]
-        force_tip = self.load[0:3] + self.load[9] * self.load[6:9]
-        moment = self.load[3:6] + np.cross(rotation @ self.load[10:13], self.load[9] * self.load[6:9])
+        force_tip = load[0:3] + load[9] * load[6:9]
+        moment = load[3:6] + np.cross(rotation @ load[10:13], load[9] * load[6:9])
         poses, strains = np.empty((s.size, 4, 4)), np.empty((s.size, 6))
-        start, e, g, mass = arm.length, len(ends) - 1, len(self.strain), 0.0
+        start, e, g, mass = arm.length, len(ends) - 1, len(strain), 0.0
         for k in range(len(arm.modules) - 1, -1, -1):
             module, (elements, q) = arm.modules[k], arm.grids[k]
             _, b, c = gauss(q)
@@ -512,7 +561,7 @@ class _Shape(NamedTuple):
                 inside = (s >= low - 1e-15) & ((s < high - 1e-15) | (e == len(ends) - 2))
                 x = (s[inside] - low) / h
                 coefficients = h * integrals(c, x)
-                rate = np.array([_half_product(quaternion[g + j], self.strain[g + j, :3]) for j in range(q)])
+                rate = np.array([_half_product(quaternion[g + j], strain[g + j, :3]) for j in range(q)])
                 for index, a, here in zip(np.flatnonzero(inside), coefficients, x, strict=True):
                     frame = pose(ends[e] + a @ rate, position[e] + a @ tangent[g : g + q])
                     r = frame[:3, :3]
@@ -520,18 +569,18 @@ class _Shape(NamedTuple):
                     wrench = np.concatenate(
                         [
                             r.T @ (moment + (h * b - a) @ spin[g : g + q]),
-                            r.T @ (force_tip + below * self.load[6:9]),
+                            r.T @ (force_tip + below * load[6:9]),
                         ]
                     )
                     fraction = (piece + here) / elements
                     route = np.array([module.route(m, fraction) for m in module.muscles]).reshape(-1, 4)
-                    nearest = self.strain[g + int(np.argmin(np.abs(c - here)))]
+                    nearest = strain[g + int(np.argmin(np.abs(c - here)))]
                     poses[index] = frame
                     strains[index] = section.solve(
                         module.stiffness,
                         module.reference_strain,
                         route,
-                        self.tension[muscles],
+                        tension[muscles],
                         wrench,
                         nearest,
                     )

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tca_envs.mechanics.algebra import entry, inner
+from tca_envs.mechanics.collocation import CLOSED_FORM
 from tca_envs.mechanics.muscle import TENDON, elongation
 
 Array = NDArray[np.float64]
@@ -20,8 +21,6 @@ MAX_ITERATIONS = 30
 MAX_STEP = 0.5
 """Of the rotation over a module [rad] and of the rest of the strain."""
 ROUND_OFF = 1e-12
-CLOSED_FORM = 4
-"""The rung of `collocation.solve_lanes` that this is."""
 
 
 class Sections(NamedTuple):
@@ -200,5 +199,5 @@ def solve_lane(model, sections, strain, tension, from_drive, from_load, drive, l
     strain[0], tension[0], lengths[0], from_drive[0], from_load[0] = found, pull, path, drive[0], load[0]
     tip[0, :3, :3] = rotation
     tip[0, :3, 3] = position
-    report[0, 0], report[0, 1], report[0, 2] = CLOSED_FORM, worst, iterations
+    report[0, 0], report[0, 1], report[0, 2], report[0, 3] = CLOSED_FORM, worst, iterations, 0.0
     return True

@@ -39,6 +39,7 @@ from tca_envs.mechanics.algebra import (
     inner,
     inverse,
     matmul,
+    negatives,
     outer,
     put3,
     put4,
@@ -49,7 +50,7 @@ from tca_envs.mechanics.algebra import (
     scalar_matrix,
     transpose,
 )
-from tca_envs.mechanics.muscle import TENDON, elongation
+from tca_envs.mechanics.muscle import TENDON, elongation, pull, stored
 
 Array = NDArray[np.float64]
 
@@ -59,12 +60,31 @@ LOAD = 13
 PAYLOAD_MASS = 9
 
 MAX_ITERATIONS = 12
-MAX_FALL = 400
-MAX_ROTATION_STEP = 0.5  # rad
+MAX_ROTATION_STEP = 1.0  # rad
 MAX_SHEAR_STEP = 0.5
+CONTRACTION = 0.5
+ROUND_OFF = 1e-8
+"""A step that is shorter need not contract."""
+SAFE = 0.02
+"""Old factors certify stability where their pivots over the rod's stiffness are above this; an unloaded rod's are 0.29."""
+NEUTRAL = 1e-5
+"""Smallest eigenvalues of the tangent (see `ladder.smallest_eigenvalue`) above minus this are neutral, not unstable: an arm
+that can turn about an axis of symmetry without any work has a zero among them, up to the grid's error. Newton adds so many
+times the rod's stiffness to the tangent, or it would be singular there."""
+FIRST_SUBSTEP = 0.25
+SMALLEST_SUBSTEP = 1.0 / 1024.0
+WORK = 10_000
+"""Nodes times Newton iterations of one call: some milliseconds."""
 SWEEPS = 60
 REUSE = 0.3  # Newton keeps its factors as long as a step shrinks the residual to less than this
 ORIGIN = (0.0, 0.0, 0.0)
+
+WARM, SUBSTEPS, FINER, DESCENT, FAILED, CLOSED_FORM = 0, 1, 2, 3, 4, 5
+"""Rungs of the ladder, see `equilibrium.Rung`."""
+REPORT = 4
+"""Numbers in the report of a lane, see `solve_lanes`."""
+SHAPE, INERTIA, STEP, GIVEN, JACOBIAN = 0, 1, 2, 3, 4
+"""What `linearise` is asked for."""
 
 
 class Model(NamedTuple):
@@ -328,7 +348,7 @@ def evaluate(model, strain, tension, drive, load, guessed, ws):
 
 @inner
 def _section(model, k, g, tension, strain, damping, ws):
-    """Linearise the section at node g: H = K + sum_i F_i d[r x t; t]/dxi, dv eliminated.
+    """Linearise the section at node g: H = K + sum_i F_i d[r x t; t]/dxi, dv eliminated; return H_vv's negative eigenvalues.
 
     In the body frame, with n = R^T n, m = R^T m, B = H_vv^-1 and G = H_uv B:
     S = H_uu - G H_vu; N = G [n] - [m]; X = v n^T - (v.n) 1 - [n] B [n]; Y = [n] G^T; e = c_u - G c_v; z = [n] B c_v.
@@ -374,6 +394,7 @@ def _section(model, k, g, tension, strain, damping, ws):
         cu, cv = get3(ws.wrench, g, 6 * c), get3(ws.wrench, g, 6 * c + 3)
         put3(ws.pull, g, 3 * c, apply(r, axpy(-1.0, apply(gain, cv), cu)))
         put3(ws.swing, g, 3 * c, apply(r, apply(nf, cv)))
+    return negatives(flexibility)
 
 
 @inner
@@ -385,7 +406,16 @@ def eliminate(model, strain, tension, load, damping, ws):
     D_r0 = P + h sum_k A_rk X_k and D_rF = Q + h sum_k A_rk z_k. Node r balances M w_r + N phi_r + e dF - dm_r = -rho_r;
     row 0 is the moment at the element's base, which the element before it sees. Path lengths follow from
     dl = stretch w + alpha phi_0 + beta dF.
+
+    Returns
+    -------
+    tuple
+        How many eigenvalues of the tangent, as a quadratic form in the strain, are negative: those of the pivots, by
+        Sylvester's law of inertia, and by Haynsworth's, as each muscle's row brings in a negative one where it has not made up
+        for one of the rod's. And a lower bound of the smallest eigenvalue of the nodes' pivots over the rod's stiffness:
+        zero at the latest where the equilibrium turns unstable.
     """
+    index, worst = 0, 0.0  # worst: largest trace of an inverse pivot times stiffness
     a, b, elements, nodes, first_muscle = model.a, model.b, model.elements, model.nodes, model.first_muscle
     matrix, phi, pulled, base, stretch = ws.matrix, ws.phi, ws.pulled, ws.base, ws.stretch
     pull, swing, x_block, y_block, n_block, beta = (
@@ -416,7 +446,7 @@ def eliminate(model, strain, tension, load, damping, ws):
         for _ in range(elements[k]):
             g0 -= q
             for j in range(q):
-                _section(model, k, g0 + j, tension, strain, damping, ws)
+                index += _section(model, k, g0 + j, tension, strain, damping, ws)
             inside = g0 > 0  # nothing turns the arm's own base: there phi_0 is zero and row 0 is of no use
             p_new = zero
             for r in range(q + 1):  # row 0: the base; rows 1..q: the nodes
@@ -475,7 +505,10 @@ def eliminate(model, strain, tension, load, damping, ws):
                     for j in range(q):
                         t, t2 = get3(ws.wrench, g0 + j, 6 * c + 3), get3(ws.wrench, g0 + j, 6 * c2 + 3)
                         beta[c, c2] -= h * b[k, j] * dot(t, apply(get9(ws.compliance, g0 + j), t2))
-            _factorise_blocks(matrix, phi, pulled, inside, g0, q, wide, mk)
+            negative, most = _factorise_blocks(matrix, phi, pulled, inside, g0, q, wide, mk)
+            index += negative
+            stiff = max(model.stiffness[k, 0], model.stiffness[k, 1], model.stiffness[k, 2])
+            worst = max(worst, stiff * most)
             for l in range(g0, g0 + q):
                 p_new = axpy9(1.0, matmul(get9(base, l), get9(phi, l)), p_new)
                 for c in range(mk):
@@ -498,7 +531,7 @@ def eliminate(model, strain, tension, load, damping, ws):
             muscle[c, c] -= ws.softness[i0 + c]
             put3(follow, c, 0, ORIGIN if tendon else get3(handed, alpha + c, 0))
             put3(ws.muscle_moment[k], c, 0, get3(handed, big_q + c, 0))
-        _factorise(muscle, mk)
+        index -= _factorise(muscle, mk)
         for d in range(3):
             for c in range(mk):
                 ws.gamma[c] = follow[c, d]
@@ -507,6 +540,7 @@ def eliminate(model, strain, tension, load, damping, ws):
                 follow[c, d] = ws.gamma[c]
         for c in range(mk):
             p_end = axpy9(-1.0, outer(get3(handed, big_q + c, 0), get3(follow, c, 0)), p_end)
+    return index, (1.0 / worst if index == 0 and worst < np.inf else 0.0)
 
 
 @inner
@@ -514,11 +548,15 @@ def _factorise_blocks(matrix, phi, pulled, inside, g0, q, wide, mk):
     """LU without pivoting, in 3 x 3 blocks, of an element's matrix; `phi` (if `inside`) and `pulled` become the solutions.
 
     At a stable equilibrium the matrix is positive definite up to a diagonal scaling, so pivoting buys nothing; where it is
-    singular the answer is not finite. Diagonal blocks are stored inverted.
+    singular the answer is not finite. Diagonal blocks are stored inverted. Returns how many of their eigenvalues are negative,
+    and the largest trace of an inverse (inf if any is).
     """
+    negative, most = 0, 0.0
     for k in range(q):
         row_k = (g0 + k) * wide
         pivot = inverse(get9(matrix, row_k + k))
+        negative += negatives(pivot)
+        most = max(most, pivot[0] + pivot[4] + pivot[8])
         put9(matrix, row_k + k, pivot)
         phi_k = get9(phi, g0 + k)
         for i in range(k + 1, q):
@@ -545,17 +583,21 @@ def _factorise_blocks(matrix, phi, pulled, inside, g0, q, wide, mk):
             for l in range(k + 1, q):
                 x = axpy(-1.0, apply(get9(matrix, row_k + l), get3(pulled, g0 + l, 3 * c)), x)
             put3(pulled, g0 + k, 3 * c, apply(get9(matrix, row_k + k), x))
+    return negative, (most if negative == 0 else np.inf)
 
 
 @inner
 def _factorise(mat, size):
-    """LU without pivoting of mat[:size, :size], in place, the diagonal of U inverted: definite, as in blocks."""
+    """LU without pivoting of mat[:size, :size], in place, the diagonal of U inverted; returns how many pivots are positive."""
+    positive = 0
     for k in range(size):
+        positive += 1 if mat[k, k] > 0.0 else 0
         mat[k, k] = 1.0 / mat[k, k]
         for i in range(k + 1, size):
             mat[i, k] *= mat[k, k]
             for j in range(k + 1, size):
                 mat[i, j] -= mat[i, k] * mat[k, j]
+    return positive
 
 
 @inner
@@ -666,73 +708,70 @@ def substitute(model, ws):
 
 
 @inner
-def newton(model, strain, tension, drive, load, damping, moved, ws):
-    """Solve by Newton from (strain, tension), in place.
+def newton(model, strain, tension, drive, load, moved, ws):
+    """Solve by Newton from (strain, tension), in place, on the branch of equilibria that these are near.
 
-    Without `damping`, Newton must go straight to the answer: it gives up if a step turns a section by more than
-    MAX_ROTATION_STEP or if it takes long, because a solve that has to be steered may end on another branch of equilibria.
-    With `damping`, each step is one of linearly implicit Euler for a rod with viscosity proportional to K, its time step
-    growing as the residual falls (pseudo-transient continuation): the fall of a real, strongly damped arm. What has `moved`,
-    drive or load, takes a step even where the start would do: a small change moves the arm a little, not in jerks. There is one
-    call of `evaluate` for all this, because the compiler inlines every call.
+    Newton must go straight to the answer. It gives up where a step turns a section by more than MAX_ROTATION_STEP; where a step
+    is not CONTRACTION times shorter than the one before; or if it takes long. For a solve that has to be steered may end on
+    another branch, and one that contracts stays on its own: with steps half as long each time no singular tangent lies on the
+    way (the theorem of Newton and Kantorovich in affine covariant form; Deuflhard, Newton Methods for Nonlinear Problems, 2004,
+    section 5.1). What has `moved`, drive or load, takes a step even where the
+    start would do: a small change moves the arm a little, not in jerks.
+
+    The answer must be stable by the count of `eliminate`. Factors of an earlier step serve for this as they do for the steps,
+    unless they are near to singular.
 
     Returns
     -------
     tuple
         converged (bool), dimensionless residual, iterations.
     """
-    total = worst = np.inf
-    iterations = 0
-    falling = damping > 0.0
+    worst = size = np.inf
+    margin, iterations = 0.0, 0
     while True:
         before = worst
-        worst, new_total = evaluate(model, strain, tension, drive, load, iterations > 0, ws)
-        if worst < model.tolerance and (iterations > 0 or not moved):
+        worst, _ = evaluate(model, strain, tension, drive, load, iterations > 0, ws)
+        there = worst < model.tolerance and (iterations > 0 or not moved)
+        if there and margin > SAFE:
             return True, worst, iterations
-        if not worst < np.inf or iterations == (MAX_FALL if falling else MAX_ITERATIONS):
+        if not worst < np.inf or (iterations == MAX_ITERATIONS and not there):
             return False, worst, iterations
-        if falling and iterations > 0:
-            damping *= min(2.0, max(0.5, np.sqrt(new_total / total)))
-        total = new_total
         # Near the answer a step with old factors gains almost as much as one with new ones, at a third of the cost.
-        if falling or not worst < REUSE * before or before == np.inf:
-            eliminate(model, strain, tension, load, damping, ws)
+        if there or not worst < REUSE * before or before == np.inf:
+            index, margin = eliminate(model, strain, tension, load, NEUTRAL, ws)
+            if there:
+                return index == 0, worst, iterations
         rotation, shear = substitute(model, ws)
-        step = min(1.0, MAX_ROTATION_STEP / max(rotation, 1e-300), MAX_SHEAR_STEP / max(shear, 1e-300))
-        if not (step == 1.0 or (falling and step > 1e-6)):
+        last, size = size, rotation + shear
+        if not (rotation < MAX_ROTATION_STEP and shear < MAX_SHEAR_STEP and (size < CONTRACTION * last or size < ROUND_OFF)):
             return False, worst, iterations
         iterations += 1
         for g in range(strain.shape[0]):
-            put3(strain, g, 0, axpy(step, get3(ws.bend, g, 0), get3(strain, g, 0)))
-            put3(strain, g, 3, axpy(step, get3(ws.shear, g, 0), get3(strain, g, 3)))
-            half = axpy(0.5 * step, get3(ws.turned, g, 0), ORIGIN)
+            put3(strain, g, 0, axpy(1.0, get3(ws.bend, g, 0), get3(strain, g, 0)))
+            put3(strain, g, 3, axpy(1.0, get3(ws.shear, g, 0), get3(strain, g, 3)))
+            half = axpy(0.5, get3(ws.turned, g, 0), ORIGIN)
             put4(ws.quaternion, g, quaternion_turn(half, get4(ws.quaternion, g)))
         for i in range(tension.size):
-            tension[i] += step * ws.tension[i]
-
-
-WARM, SUBSTEPS, FALL, FAILED = 0, 1, 2, 3
-SMALLEST_SUBSTEP = 1.0 / 128.0
-FIRST_DAMPING = 1.0
+            tension[i] += ws.tension[i]
 
 
 @inner
-def solve(model, strain, tension, from_drive, from_load, drive, load, ws):
-    """Find the equilibrium that continues a known one, in place.
+def solve(model, strain, tension, from_drive, from_load, drive, load, budget, ws):
+    """Follow the branch of equilibria from a known one to the asked one, in place.
 
-    Newton from the known state first. Where it fails, drive and load go from the known ones to the asked ones in substeps,
-    halved on failure and doubled on success. Where the branch of equilibria ends on the way (a fold), the arm falls from
-    there, at the asked drive and load. Arguments as in `solve_lanes`, for one arm.
+    Newton from the known state first; its first step is the tangent's prediction. Where it fails, drive and load go from the
+    known ones to the asked ones in substeps, shortened on failure and doubled on success. Arguments as in `solve_lanes`, for
+    one arm.
 
     Returns
     -------
     tuple
-        rung (WARM, SUBSTEPS, FALL or FAILED), dimensionless residual, Newton iterations in all.
+        rung (WARM, SUBSTEPS or FAILED), dimensionless residual, Newton iterations in all.
     """
-    strain0, tension0 = strain.copy(), tension.copy()
-    good_strain, good_tension = strain0.copy(), tension0.copy()
+    first_drive, first_load = from_drive.copy(), from_load.copy()
+    good_strain, good_tension = strain.copy(), tension.copy()
     drive_now, load_now = drive.copy(), load.copy()
-    done, step, spent, rung, damping, moved = 0.0, 1.0, 0, WARM, 0.0, False
+    done, step, spent, rung, moved = 0.0, 1.0, 0, WARM, False
     for i in range(drive.size):
         moved |= drive[i] != from_drive[i]
     for i in range(load.size):
@@ -740,57 +779,61 @@ def solve(model, strain, tension, from_drive, from_load, drive, load, ws):
     while True:
         here = min(1.0, done + step)
         for i in range(drive.size):
-            drive_now[i] = drive[i] if here == 1.0 else from_drive[i] + here * (drive[i] - from_drive[i])
+            drive_now[i] = drive[i] if here == 1.0 else first_drive[i] + here * (drive[i] - first_drive[i])
         for i in range(load.size):
-            load_now[i] = load[i] if here == 1.0 else from_load[i] + here * (load[i] - from_load[i])
-        converged, worst, iterations = newton(model, strain, tension, drive_now, load_now, damping, moved, ws)
+            load_now[i] = load[i] if here == 1.0 else first_load[i] + here * (load[i] - first_load[i])
+        converged, worst, iterations = newton(model, strain, tension, drive_now, load_now, moved, ws)
         spent += iterations
         if converged:
+            from_drive[:] = drive_now
+            from_load[:] = load_now
             if here == 1.0:
                 return rung, worst, spent
             done, step = here, 2.0 * step
             good_strain[:] = strain
             good_tension[:] = tension
             continue
-        if rung == FALL or not model.ladder:
-            strain[:] = strain0
-            tension[:] = tension0
-            return FAILED, worst, spent
         strain[:] = good_strain
         tension[:] = good_tension
-        step = 0.25 if rung == WARM else 0.5 * step
+        step = FIRST_SUBSTEP if rung == WARM else 0.5 * step
         rung = SUBSTEPS
-        if step < SMALLEST_SUBSTEP:
-            rung, step, damping = FALL, 1.0, FIRST_DAMPING
+        if step < SMALLEST_SUBSTEP or spent >= budget or not model.ladder:
+            return FAILED, worst, spent
 
 
 def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report):
-    """Solve N arms of one model, each from its own known equilibrium.
+    """Follow the branches of N arms of one model, each from its own known equilibrium.
 
     Parameters
     ----------
     model : Model
         The arm.
     strain, tension : (N, G, 6), (N, n) arrays
-        In: known equilibria. Out: the asked ones; unchanged where there was none.
+        In: known equilibria. Out: the asked ones; where there was none, the last ones on the way.
     from_drive, from_load : (N, n), (N, LOAD) arrays
-        In: where (strain, tension) are in equilibrium. Out: the asked ones; unchanged where there was none.
+        In: where (strain, tension) are in equilibrium. Out: where they are now: as asked, or as far as the branch went.
     drive, load : (N, n), (N, LOAD) arrays
         What is asked.
     tip : (N, 4, 4) array
         Out: tip poses [m], but for the last row, which stays; unchanged where there was no answer.
     lengths : (N, n) array
         Out: path lengths [m]; unchanged where there was no answer.
-    report : (N, 3) array
-        Out: rung (WARM, SUBSTEPS, FALL or FAILED), dimensionless residual, Newton iterations.
+    report : (N, REPORT) array
+        Out: rung (WARM, SUBSTEPS or FAILED), dimensionless residual, Newton iterations, jumped (0). A lane is given up after
+        `budget` iterations.
     """
-    _solve_lanes(*model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report)
+    _solve_lanes(*model, strain, tension, from_drive, from_load, drive, load, budget(model), tip, lengths, report)
+
+
+def budget(model):
+    """Return the Newton iterations after which `solve_lanes` gives a lane up, so that someone can look at the clock."""
+    return max(MAX_ITERATIONS, WORK // len(model.mass_below))
 
 
 @entry
 def _solve_lanes(
     elements, nodes, length, a, b, stiffness, reference, first_muscle, route, mass_below, kind, parameters, rest_length,
-    tolerance, ladder, strain, tension, from_drive, from_load, drive, load, tip, lengths, report,
+    tolerance, ladder, strain, tension, from_drive, from_load, drive, load, budget, tip, lengths, report,
 ):  # fmt: skip
     """`solve_lanes` with the model's fields one by one: of a NamedTuple Numba works out the type anew at every call."""
     model = Model(
@@ -800,9 +843,9 @@ def _solve_lanes(
     ws = workspace(model)
     for lane in range(strain.shape[0]):
         rung, worst, iterations = solve(
-            model, strain[lane], tension[lane], from_drive[lane], from_load[lane], drive[lane], load[lane], ws
+            model, strain[lane], tension[lane], from_drive[lane], from_load[lane], drive[lane], load[lane], budget, ws
         )
-        report[lane, 0], report[lane, 1], report[lane, 2] = rung, worst, iterations
+        report[lane, 0], report[lane, 1], report[lane, 2], report[lane, 3] = rung, worst, iterations, 0.0
         if rung == FAILED:
             continue
         r = rotation_matrix(get4(ws.ends, ws.ends.shape[0] - 1))
@@ -812,34 +855,109 @@ def _solve_lanes(
         put3(pose, 2, 0, (r[6], r[7], r[8]))
         pose[:3, 3] = ws.position[-1]
         lengths[lane] = ws.length
-        from_drive[lane] = drive[lane]
-        from_load[lane] = load[lane]
 
 
-@entry
-def tip_jacobian(model, strain, tension, drive, load):
-    """Return d(tip position, tip rotation)/d drive (6, n) by the implicit function theorem; not finite where it has none."""
-    ws = workspace(model)
-    jacobian = np.empty((6, tension.size))
-    evaluate(model, strain, tension, drive, load, False, ws)
-    eliminate(model, strain, tension, load, 0.0, ws)
-    ws.residual[:] = 0.0
-    ws.gap[:] = 0.0
+@inner
+def _energy(model, strain, tension, load, ws):
+    """Return the total energy [J] of the state last given to `evaluate`, without a tip moment, which has no potential.
+
+    Rod and muscles store it, loads lose it: int n . p' ds is the work of the tip force and of all weights but the lever of the
+    payload's.
+    """
+    total, g = 0.0, 0
+    for k in range(model.elements.size):
+        h = model.length[k] / model.elements[k]
+        for _ in range(model.elements[k]):
+            for j in range(model.nodes[k]):
+                density = -dot(get3(ws.force, g, 0), get3(strain, g, 3))
+                for i in range(6):
+                    density += 0.5 * model.stiffness[k, i] * (strain[g, i] - model.reference[k, i]) ** 2
+                total += h * model.b[k, j] * density
+                g += 1
+    lever = apply(rotation_matrix(get4(ws.ends, ws.ends.shape[0] - 1)), (load[10], load[11], load[12]))
+    total -= load[PAYLOAD_MASS] * dot(lever, (load[6], load[7], load[8]))
     for i in range(tension.size):
-        if model.kind[i] == TENDON:
-            ws.gap[i] = 1.0  # its row reads -dF = -gap
-        else:
-            _, _, slope = elongation(model.kind[i], model.parameters, i, model.rest_length[i], tension[i], drive[i])
-            ws.gap[i] = -slope
-        substitute(model, ws)
-        jacobian[:, i] = ws.tip
-        ws.gap[i] = 0.0
-    return jacobian
+        total += stored(model.kind[i], model.parameters, i, model.rest_length[i], tension[i], ws.length[i])
+    return total
 
 
 @entry
-def shape(model, strain, tension, drive, load):
-    """Return an evaluated state: quaternions at ends and nodes, positions at ends, p' and p' x n at nodes, path lengths."""
+def linearise(model, strain, tension, drive, load, damping, slaved, ask, given):
+    """Evaluate a state and what follows from its tangent; everything but the hot path is made of this.
+
+    Parameters
+    ----------
+    model : Model
+        The arm.
+    strain, tension : (G, 6), (n,) arrays
+        The state.
+    drive, load : (n,), (LOAD,) arrays
+        Drives and load.
+    damping : float
+        So many times the rod's stiffness K is added to the tangent.
+    slaved : bool
+        Whether tensions follow from the path lengths; `tension` is overwritten then.
+    ask : int
+        SHAPE: the state alone; INERTIA: factors, too; STEP: Newton's step; GIVEN: the step under the imbalance `given`;
+        JACOBIAN: derivatives in the drives.
+    given : (G, 6) array
+        Imbalance at the nodes.
+
+    Returns
+    -------
+    tuple
+        Residual, sum of its squares, energy [J] (true where tensions are slaved), `eliminate`'s count and bound, the step's
+        largest rotation [rad] and largest dv, its work against the imbalance g . dx and its size dx . K dx [J], as an array
+        (9,); quaternions at element ends and nodes, positions at ends, p' and p' x n at the nodes, path lengths; bend and
+        shear of the step (G, 3); d(tip position, tip rotation) of the step or, for JACOBIAN, by each drive (6, 1 or n): by
+        the implicit function theorem, not finite where it has none.
+    """
     ws = workspace(model)
-    evaluate(model, strain, tension, drive, load, False, ws)
-    return ws.ends, ws.quaternion, ws.position, ws.tangent, ws.spin, ws.length
+    n = tension.size
+    numbers = np.zeros(9)
+    columns = n if ask == JACOBIAN else (1 if ask >= STEP else 0)
+    tips = np.zeros((6, max(columns, 1)))
+    worst = total = np.inf
+    for again in range(2 if slaved else 1):
+        worst, total = evaluate(model, strain, tension, drive, load, again > 0, ws)
+        if not worst < np.inf:
+            break
+        if slaved and again == 0:
+            for i in range(n):
+                if model.kind[i] != TENDON:
+                    tension[i] = pull(
+                        model.kind[i], model.parameters, i, model.rest_length[i], ws.length[i], drive[i], tension[i]
+                    )
+    numbers[0], numbers[1] = worst, total
+    if worst < np.inf:
+        numbers[2] = _energy(model, strain, tension, load, ws)
+        if ask != SHAPE:
+            index, numbers[4] = eliminate(model, strain, tension, load, damping, ws)
+            numbers[3] = index
+        if ask >= GIVEN:
+            ws.gap[:] = 0.0
+            for g in range(strain.shape[0]):
+                for i in range(6):
+                    ws.residual[g, i] = given[g, i] if ask == GIVEN else 0.0
+        for i in range(columns):
+            if ask == JACOBIAN:
+                if model.kind[i] == TENDON:
+                    ws.gap[i] = 1.0  # its row reads -dF = -gap
+                else:
+                    _, _, slope = elongation(model.kind[i], model.parameters, i, model.rest_length[i], tension[i], drive[i])
+                    ws.gap[i] = -slope
+            numbers[5], numbers[6] = substitute(model, ws)
+            tips[:, i] = ws.tip
+            if ask == JACOBIAN:
+                ws.gap[i] = 0.0
+        g = 0
+        for k in range(model.elements.size):
+            h = model.length[k] / model.elements[k]
+            for node in range(model.elements[k] * model.nodes[k]):
+                weight = h * model.b[k, node % model.nodes[k]]
+                for i in range(3 if columns else 0):
+                    bend, shear = ws.bend[g, i], ws.shear[g, i]
+                    numbers[7] += weight * (ws.residual[g, i] * bend + ws.residual[g, 3 + i] * shear)
+                    numbers[8] += weight * (model.stiffness[k, i] * bend**2 + model.stiffness[k, 3 + i] * shear**2)
+                g += 1
+    return numbers, ws.ends, ws.quaternion, ws.position, ws.tangent, ws.spin, ws.length, ws.bend, ws.shear, tips

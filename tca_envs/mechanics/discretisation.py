@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tca_envs.mechanics import check
 from tca_envs.mechanics.arm import MAX_NODES, Arm, Grid, Module, carried
-from tca_envs.mechanics.collocation import FAILED, LOAD, Model, solve_lanes
+from tca_envs.mechanics.collocation import FAILED, LOAD, REPORT, Model, solve_lanes
 
 Array = NDArray[np.float64]
 
@@ -210,6 +210,6 @@ def _carried(known: Known, arm: Arm, off: float = 0.0) -> Known:
 def _solve(
     arm: Arm, model: Model, drive: Array, load: Array, strain: Array, tension: Array, from_drive: Array, from_load: Array
 ) -> Known:
-    tip, lengths, report = np.tile(np.eye(4), (len(drive), 1, 1)), np.empty_like(drive), np.empty((len(drive), 3))
+    tip, lengths, report = np.tile(np.eye(4), (len(drive), 1, 1)), np.empty_like(drive), np.empty((len(drive), REPORT))
     solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report)
     return Known(arm, drive, load, strain, tension, tip[:, :3, 3], report[:, 0] != FAILED)

@@ -2,15 +2,33 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tca_envs.mechanics import check
+from tca_envs.mechanics import check, collocation
 from tca_envs.mechanics.collocation import Model
 
 Array = NDArray[np.float64]
+
+
+class Rung(IntEnum):
+    """Which rung of the ladder answered; each is tried where the one before fails."""
+
+    WARM = collocation.WARM
+    """Newton straight from the start."""
+    SUBSTEPS = collocation.SUBSTEPS
+    """Newton in substeps of drive and load."""
+    FINER = collocation.FINER
+    """The same on a grid of twice the elements."""
+    DESCENT = collocation.DESCENT
+    """The start's branch ends: a fall down the hill of the total energy, and on from there."""
+    FAILED = collocation.FAILED
+    """None."""
+    CLOSED_FORM = collocation.CLOSED_FORM
+    """Nothing loads the arm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +47,11 @@ class Equilibrium:
         The drives: temperature [degC], tension [N] or rest length [m].
     converged : bool
         Whether this is an equilibrium at the asked drive and load. Otherwise the shape is that of the start.
+    rung : Rung
+        Which rung of the ladder answered. `shooting` knows none: WARM or FAILED.
+    jumped : bool
+        Whether the start's branch of equilibria ends on the way to the asked drive and load, and the arm fell to another one
+        and would not come back on the same way (a fold, a snap-through). Answers without a jump are on the start's branch.
     residual : float
         Dimensionless: the largest of |moment imbalance| L/EI (an angle over the module; GJ in torsion), |force
         imbalance|/GA (a strain; EA along the axis) and |muscle length mismatch|/rest length over all nodes and muscles.
@@ -36,7 +59,7 @@ class Equilibrium:
     iterations : int
         Newton iterations (evaluations of the residual for `shooting`).
     message : str
-        What happened.
+        What happened: why the rungs before the one that answered did not.
     """
 
     tip_pose: Array
@@ -44,6 +67,8 @@ class Equilibrium:
     muscle_lengths: Array
     drive: Array
     converged: bool
+    rung: Rung
+    jumped: bool
     residual: float
     iterations: int
     message: str
@@ -55,6 +80,8 @@ class Equilibrium:
     """Arc positions (k,) -> poses (k, 4, 4), strains (k, 6)."""
     differentiate: Callable[[], Array] = field(repr=False)
     """() -> d(tip position, tip rotation vector)/d drive (6, n)."""
+    certify: Callable[[], float] = field(repr=False)
+    """() -> `stability`."""
     nodes: tuple[Model, Array] | None = field(default=None, repr=False)
     """The arm's compiled model and the strains at its nodes: what a warm start reads."""
 
@@ -76,6 +103,22 @@ class Equilibrium:
     def tip_jacobian(self) -> Array:
         """d(tip position [m], tip rotation vector [rad])/d drive, (6, n); the rotation is that added in the base frame."""
         return self.differentiate()
+
+    @cached_property
+    def stability(self) -> float:
+        """Smallest eigenvalue lambda of T x = lambda K x, dimensionless: positive at a stable equilibrium.
+
+        T is the second variation of the total energy in the strain x, the muscles' tensions following from their lengths, and K
+        the rod's stiffness, eq. (3): 1 for the unloaded rod, 0 at a fold or a bifurcation. It is also the rate at which a
+        disturbance of a rod with viscosity K (in units of time) dies out. A tip moment has no potential: T is that of its work
+        then, not symmetric, and the criterion that of static instability (divergence).
+        """
+        return self.certify()
+
+    @property
+    def stable(self) -> bool:
+        """Whether this equilibrium is stable: `stability` > 0; or 0 within 1e-5, as where an arm can turn without any work."""
+        return self.stability > -collocation.NEUTRAL
 
     def _arc(self, s: ArrayLike) -> Array:
         positions = check.array("s", [s] if isinstance(s, int | float) else s, (None,))

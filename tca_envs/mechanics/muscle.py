@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tca_envs.mechanics import check
-from tca_envs.mechanics.algebra import entry
+from tca_envs.mechanics.algebra import entry, inner
 
 TENDON, SPRING, COIL = 0, 1, 2
 PARAMETERS = 11
@@ -61,6 +61,34 @@ def elongation(kind, parameters, i, rest_length, tension, drive):
     if kind == SPRING:
         return drive + tension / parameters[i, 0] - rest_length, 1.0 / parameters[i, 0], 1.0
     return 0.0, 0.0, 0.0
+
+
+@inner
+def pull(kind, parameters, i, rest_length, length, drive, guess):
+    """Return the tension [N] at which a muscle, no tendon, has a path length [m]: Newton, for elongation grows with tension."""
+    tension = guess
+    for _ in range(60):
+        delta, softness, _ = elongation(kind, parameters, i, rest_length, tension, drive)
+        step = (length - rest_length - delta) / softness
+        tension += step
+        if abs(step) <= 1e-14 + 1e-13 * abs(tension):
+            break
+    return tension
+
+
+@inner
+def stored(kind, parameters, i, rest_length, tension, length):
+    """Return the energy [J] in a muscle at a tension: int F dl over the lengths, which is int f (dl/df) df; F l of a tendon."""
+    if kind == TENDON:
+        return tension * length
+    # Simpson's rule inside the measured range; the law is linear outside.
+    inside = min(max(tension, 0.0), parameters[i, 8]) if kind == COIL else tension
+    h, total = inside / 32.0, 0.0
+    for k in range(33):
+        weight = 1.0 if k in (0, 32) else (4.0 if k % 2 else 2.0)
+        total += weight * k * h * elongation(kind, parameters, i, rest_length, k * h, 0.0)[1]
+    end = elongation(kind, parameters, i, rest_length, tension, 0.0)[1]
+    return total * h / 3.0 + 0.5 * end * (tension * tension - inside * inside)
 
 
 class Law(Protocol):

@@ -30,7 +30,8 @@ from scipy.spatial.transform import Rotation
 
 from tca_envs.mechanics import check, section
 from tca_envs.mechanics.arm import ZERO, Arm, Module, Payload, pose
-from tca_envs.mechanics.equilibrium import Equilibrium
+from tca_envs.mechanics.equilibrium import Equilibrium, Rung
+from tca_envs.mechanics.ladder import smallest_eigenvalue
 from tca_envs.mechanics.muscle import TENDON, elongation
 
 Array = NDArray[np.float64]
@@ -122,8 +123,8 @@ def equilibrium(
     Returns
     -------
     Equilibrium
-        `residual` is the largest entry of eq. (29), dimensionless as `residual` returns it; `iterations` counts its
-        evaluations. Where the root finder or an integration failed: `converged` False, the reason in `message`, and
+        Of any stability. `residual` is the largest entry of eq. (29), dimensionless as `residual` returns it; `iterations`
+        counts its evaluations. Where the root finder or an integration failed: `converged` False, the reason in `message`, and
         the start's shape, without a start that of the unloaded arm.
 
     Raises
@@ -154,7 +155,7 @@ def equilibrium(
         if report["converged"]:
             return _result(problem, problem, unknowns, report)
         if start is not None:
-            return replace(start, drive=problem.drive, load=problem.load, nodes=None, **report)
+            return replace(start, drive=problem.drive, load=problem.load, nodes=None, rung=Rung.FAILED, jumped=False, **report)
         _, tension, neutral, no_load = arm.unloaded()
         return _result(problem, Problem(arm, neutral, no_load, rtol), np.concatenate([base, tension]), report)
 
@@ -490,6 +491,12 @@ def _by_module(arm: Arm, tension: Array) -> list[Array]:
 def _result(problem: Problem, solved: Problem, unknowns: Array, report: Report) -> Equilibrium:
     """Return the answer to `problem`: the shape that solves `solved`, which is another one where none was found."""
     trajectory = integrate(solved, unknowns, dense=True)
+    sample = Sampler(problem.arm, trajectory.pieces)
+
+    def certify() -> float:
+        arm = problem.arm
+        return smallest_eigenvalue(arm.model, sample(arm.node_arc)[1], unknowns[6:], solved.drive, solved.load)
+
     return Equilibrium(
         tip_pose=trajectory.tip_pose,
         tensions=unknowns[6:],
@@ -498,7 +505,10 @@ def _result(problem: Problem, solved: Problem, unknowns: Array, report: Report) 
         length=problem.arm.length,
         load=problem.load,
         known=(solved.drive, solved.load),
-        sample=Sampler(problem.arm, trajectory.pieces),
+        rung=Rung.WARM if report["converged"] else Rung.FAILED,
+        jumped=False,
+        sample=sample,
         differentiate=partial(tip_jacobian, solved, unknowns),
+        certify=certify,
         **report,
     )

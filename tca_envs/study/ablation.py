@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tca_envs import presets
 from tca_envs.mechanics import Arm, Equilibrium, Grid, closed_form, discretise
 from tca_envs.mechanics.arm import default_grid
-from tca_envs.mechanics.collocation import FAILED, solve_lanes
+from tca_envs.mechanics.collocation import FAILED, REPORT, solve_lanes
 from tca_envs.mechanics.rotation import yaw_angle
 from tca_envs.mechanics.thermal import AMBIENT
 from tca_envs.study import output
@@ -134,7 +134,7 @@ class Lane:
         self.arm, self.load = arm, view.now.load
         self.known = [x[np.newaxis] for x in arm.restart(on(arm, view.before))]
         self.drive = view.now.drive[np.newaxis]
-        self.answer = np.eye(4)[np.newaxis].copy(), np.empty((1, view.now.drive.size)), np.empty((1, 3))
+        self.answer = np.eye(4)[np.newaxis].copy(), np.empty((1, view.now.drive.size)), np.empty((1, REPORT))
 
     def __call__(self) -> float:
         """Return the time of a solve [s]; nan where it fails."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tca_envs import presets
 from tca_envs.mechanics import TCA, Arm, Grid, Muscle
-from tca_envs.mechanics.collocation import FAILED, solve_lanes
+from tca_envs.mechanics.collocation import FAILED, REPORT, solve_lanes
 from tca_envs.study import output
 from tca_envs.study.timing import no_collection
 
@@ -90,7 +90,7 @@ class Call:
         drive[::muscles] += HOTTER
         self.load = np.repeat(self.arm.load()[np.newaxis], lanes, axis=0)
         self.tip, self.lengths = np.repeat(np.eye(4)[np.newaxis], lanes, axis=0), np.empty((lanes, n))
-        self.report = np.empty((lanes, 3))
+        self.report = np.empty((lanes, REPORT))
         self.state = [np.repeat(values[np.newaxis], lanes, axis=0) for values in self.arm.unloaded()]
         self._solve(np.repeat(drive[np.newaxis], lanes, axis=0))
         self.known = [values.copy() for values in self.state]

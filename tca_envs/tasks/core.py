@@ -10,8 +10,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs.mechanics import Arm, thermal
-from tca_envs.mechanics.collocation import FAILED, PAYLOAD_MASS, solve_lanes
+from tca_envs.mechanics import Arm, ladder, thermal
+from tca_envs.mechanics.collocation import FAILED, PAYLOAD_MASS, REPORT
 from tca_envs.mechanics.thermal import HARD_LIMIT, Heater
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ class Record:
 
 
 def solved(report: Array) -> NDArray[np.bool_]:
-    """Return which lanes of a report (..., 3) of `Core.step` have an equilibrium."""
+    """Return which lanes of a report (..., REPORT) of `Core.step` have an equilibrium."""
     return np.asarray(report[..., 0] != FAILED)
 
 
@@ -101,7 +101,7 @@ class Core:
         self.record = self.rest.rows(np.zeros(lanes, dtype=np.intp))
 
     def _rest(self, goal_size: int, scene_size: int) -> tuple[Record, Array]:
-        """Return the one-lane record of the arm at ambient temperature, where every episode starts, and its solve (1, 3)."""
+        """Return the one-lane record of the arm at ambient temperature, where episodes start, and its report (1, REPORT)."""
         ambient = np.full((1, self.heating.loss.size), self.heating.ambient)
         strain, tension, drive, load = (values[np.newaxis] for values in self.arm.unloaded())
         record = Record(
@@ -124,13 +124,13 @@ class Core:
         return record, report
 
     def _solve(self, record: Record, temperature: Array) -> Array:
-        """Bring lanes to equilibrium at `temperature`; where there is none, keep them as they are. Returns (N, 3)."""
-        report = np.empty((len(temperature), 3))
+        """Bring lanes to equilibrium at `temperature`; where there is none, keep them as they are. Returns (N, REPORT)."""
+        report = np.empty((len(temperature), REPORT))
         load = np.repeat(self.arm.load()[np.newaxis], len(temperature), axis=0)
         load[:, PAYLOAD_MASS:] = record.payload
         drive = np.ascontiguousarray(temperature[:, : record.drive.shape[1]])
-        solve_lanes(
-            self.arm.model, record.strain, record.tension, record.drive, record.load, drive, load,
+        ladder.solve(
+            self.arm, record.strain, record.tension, record.drive, record.load, drive, load,
             record.tip, record.length, report,
         )  # fmt: skip
         good = solved(report)
@@ -153,8 +153,8 @@ class Core:
 
         Returns
         -------
-        (N, 3) array
-            Rung, residual, iterations of the solver, see `solve_lanes`. A lane without equilibrium stays as it was.
+        (N, REPORT) array
+            Rung, residual, iterations and jumped of the solver, see `Equilibrium`. A lane without equilibrium stays as it was.
         """
         record, heating = self.record, self.heating
         asked = 0.5 * (np.clip(action, -1.0, 1.0) + 1.0) * heating.max_power

@@ -94,7 +94,8 @@ class PickAndPlace(Task):
 
     `info` (from `reset` too) holds `is_success` (placed now), `distance_mm`, `energy_J` (electrical energy of heating since
     the episode's start), `cost` (kelvins above the soft limit of 150 degC, summed over the TCAs) and `solver`
-    (`converged`, `residual`, `iterations`).
+    (`converged`, `residual`, `iterations`, `rung` as of `tca_envs.mechanics.Rung`, and `jumped`: the arm fell to another
+    equilibrium).
 
     ## Starting State
 

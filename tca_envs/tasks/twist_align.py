@@ -67,7 +67,8 @@ class TwistAlign(Task):
 
     `info` (from `reset` too) holds `is_success` (within both now), `distance_mm`, `yaw_error_deg`, `energy_J` (electrical
     energy since the episode's start), `cost` (kelvins above the soft limit of 150 degC, summed over the TCAs) and `solver`
-    (`converged`, `residual`, `iterations`).
+    (`converged`, `residual`, `iterations`, `rung` as of `tca_envs.mechanics.Rung`, and `jumped`: the arm fell to another
+    equilibrium).
 
     ## Starting State
 

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tca_envs.mechanics import Arm, Equilibrium, discretise
-from tca_envs.mechanics.collocation import FAILED, solve_lanes
+from tca_envs.mechanics import Arm, Equilibrium, discretise, ladder
+from tca_envs.mechanics.collocation import FAILED, REPORT
 from tca_envs.presets import STATES
 from tca_envs.study.method import Answer, Array, Method, State
 
@@ -31,7 +31,7 @@ class Lane(NamedTuple):
 
 
 class Collocation(NamedTuple):
-    """`solve_lanes` on one grid."""
+    """The ladder of an arm on its grid."""
 
     arm: Arm
 
@@ -48,9 +48,9 @@ class Collocation(NamedTuple):
     def solve(self, state: State, guess: Lane) -> Answer:
         """Solve for the equilibrium at `state`."""
         strain, tension, drive, load = guess.strain.copy(), guess.tension.copy(), guess.drive.copy(), guess.load.copy()
-        tip, lengths, report = UNIT.copy(), np.empty_like(drive), np.empty((1, 3))
+        tip, lengths, report = UNIT.copy(), np.empty_like(drive), np.empty((1, REPORT))
         asked = (state.drive[np.newaxis], state.load[np.newaxis])
-        solve_lanes(self.arm.model, strain, tension, drive, load, *asked, tip, lengths, report)
+        ladder.solve(self.arm, strain, tension, drive, load, *asked, tip, lengths, report)
         found = report[0, 0] != FAILED
         return Answer(bool(found), tip[0], Lane(strain, tension, drive, load) if found else None)
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tca_envs.mechanics import Arm, Equilibrium, shooting
+from tca_envs.mechanics import Arm, Equilibrium, Rung, shooting
 from tca_envs.study.method import Answer, Array, Method, State
 from tca_envs.study.methods import strain_basis
 
@@ -59,6 +59,8 @@ def _sketched(arm: Arm, sketch: strain_basis.Basis, state: State) -> Equilibrium
         muscle_lengths=arm.rest_lengths,
         drive=state.drive,
         converged=False,
+        rung=Rung.FAILED,
+        jumped=False,
         residual=np.inf,
         iterations=0,
         message="piecewise constant strain",
@@ -67,6 +69,7 @@ def _sketched(arm: Arm, sketch: strain_basis.Basis, state: State) -> Equilibrium
         known=(state.drive, state.load),
         sample=sample,
         differentiate=lambda: np.full((6, state.drive.size), np.nan),
+        certify=lambda: np.nan,
     )
 
 
