@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tca_envs import presets
-from tca_envs.mechanics import thermal
+from tca_envs.mechanics import Rung, ladder, thermal
 from tca_envs.study import output
 from tca_envs.study.scenes import IDS
 from tca_envs.study.timing import no_collection
@@ -44,7 +44,10 @@ GREEDY = 0.2
 """Share of these turns before which the adversary makes the largest steps that it can make all the time."""
 LIMIT = 20e-3
 """Longest time that a solve may take [s]: a fifth of a step."""
-RUNGS = ("warm", "substeps", "fall", "failed")
+RUNGS = (Rung.WARM, Rung.SUBSTEPS, Rung.FINER, Rung.DESCENT)
+"""Of the ladder: those that can answer where the arm is loaded."""
+SAMPLE = 500
+"""States of a run whose stability is looked at, at least; beside those that the upper rungs found."""
 
 
 # Policies
@@ -215,6 +218,8 @@ class Run(NamedTuple):
     """Change of the temperatures in each step (k,), Euclidean norm [K]."""
     finite: NDArray[np.bool_]
     """Whether the observation and all numbers of the arm were finite after each step (k,)."""
+    stability: Array
+    """`Equilibrium.stability` of random states and of all that upper rungs found (s,)."""
     slowest: Asked
     """Of the solve with the longest time on the processor."""
     failed: Sequence[Asked]
@@ -223,12 +228,12 @@ class Run(NamedTuple):
     @property
     def rungs(self) -> Integers:
         """How many solves each of `RUNGS` answered."""
-        return np.bincount(self.report[:, 0].astype(np.int64), minlength=len(RUNGS))
+        return np.array([(self.report[:, 0] == rung).sum() for rung in RUNGS])
 
     @property
     def jumps(self) -> int:
         """Solves in which the arm left its branch of equilibria."""
-        return int(self.report[:, 3:].sum())
+        return int(self.report[:, 3].sum())
 
 
 def drive(name: str, policy: str, steps: int, progress: Callable[[Iterable[int]], Iterable[int]] = iter) -> Run:
@@ -256,32 +261,47 @@ def drive(name: str, policy: str, steps: int, progress: Callable[[Iterable[int]]
     over = np.ones(LANES, dtype=bool)
     change: list[Array] = []
     finite: list[NDArray[np.bool_]] = []
+    stability: list[float] = []
+    rounds = -(-steps // LANES)
+    sampled = set(np.linspace(0, rounds - 1, SAMPLE).astype(int).tolist())
     with no_collection():
-        for _ in progress(range(-(-steps // LANES))):
+        for i in progress(range(rounds)):
             drawn = rng.integers(0, GOALS, over.sum())
             core.reset(np.flatnonzero(over), goals[drawn], scenes[drawn])
             age[over] = 0
             before = record.temperature.copy()
-            report = task.step(core, act(core, age))
+            told = task.step(core, act(core, age))
             age += 1
-            over = (age == episode) | ~solved(report)
+            over = (age == episode) | ~solved(told)
             change.append(np.linalg.norm(record.temperature - before, axis=1))
             numbers = [task.observe(core), *(getattr(record, f.name) for f in fields(Record))]
             finite.append(np.all([np.isfinite(n.reshape(LANES, -1)).all(axis=1) for n in numbers], axis=0))
+            rare = np.isin(told[:, 0], (Rung.FINER, Rung.DESCENT))
+            if i in sampled:
+                rare[rng.integers(LANES)] = True
+            stability += [stability_of(core, lane) for lane in np.flatnonzero(rare).tolist()]
     assert core.slowest is not None
     return Run(
         name, policy, np.concatenate(core.reports), 1e-9 * np.array(core.cpu), 1e-9 * np.array(core.wall),
-        np.concatenate(change), np.concatenate(finite), core.slowest, core.failed,
+        np.concatenate(change), np.concatenate(finite), np.array(stability), core.slowest, core.failed,
     )  # fmt: skip
+
+
+def stability_of(core: Core, lane: int) -> float:
+    """Return `Equilibrium.stability` of the state in which a lane is."""
+    record = core.record
+    return ladder.smallest_eigenvalue(
+        core.arm.model, record.strain[lane], record.tension[lane], record.drive[lane], record.load[lane]
+    )
 
 
 # What is written
 
 
 HEADER = (
-    "task", "policy", "steps", "failed", "not_finite", "jumped", *RUNGS, "median_cpu_s", "p999_cpu_s", "max_cpu_s",
-    "max_wall_s", "mean_change_K", "max_change_K", "slowest_from_degC", "slowest_to_degC", "slowest_payload_kg",
-    "failed_from_degC", "failed_to_degC", "failed_payload_kg",
+    "task", "policy", "steps", "failed", "not_finite", "jumped", *(rung.name.lower() for rung in RUNGS), "median_cpu_s",
+    "p999_cpu_s", "max_cpu_s", "max_wall_s", "mean_change_K", "max_change_K", "smallest_stability", "slowest_from_degC",
+    "slowest_to_degC", "slowest_payload_kg", "failed_from_degC", "failed_to_degC", "failed_payload_kg",
 )  # fmt: skip
 """The columns failed_... are of the first failure."""
 
@@ -292,8 +312,8 @@ def row(run: Run) -> list[object]:
     first = run.failed[0] if run.failed else Asked(np.empty(0), np.empty(0), np.nan)
     return [
         run.task, run.policy, run.cpu.size, len(run.failed), int((~run.finite).sum()), run.jumps, *run.rungs.tolist(), median,
-        p999, worst, float(run.wall.max()), float(run.change.mean()), float(run.change.max()), *written(run.slowest),
-        *written(first),
+        p999, worst, float(run.wall.max()), float(run.change.mean()), float(run.change.max()), float(run.stability.min()),
+        *written(run.slowest), *written(first),
     ]  # fmt: skip
 
 
@@ -307,12 +327,13 @@ def report(runs: Sequence[Run]) -> str:
     rows = [
         [r.task, r.policy, f"{r.cpu.size}", f"{len(r.failed)}", f"{(~r.finite).sum()}", f"{r.jumps}",
          *(f"{count}" for count in r.rungs), *(f"{1e6 * t:.0f}" for t in np.quantile(r.cpu, [0.5, 0.999])),
-         f"{1e3 * r.cpu.max():.2f}", f"{1e3 * r.wall.max():.2f}", f"{r.change.mean():.1f}", f"{r.change.max():.1f}"]
+         f"{1e3 * r.cpu.max():.2f}", f"{1e3 * r.wall.max():.2f}", f"{r.change.mean():.1f}", f"{r.change.max():.1f}",
+         f"{r.stability.min():.1g}"]
         for r in runs
     ]  # fmt: skip
     header = [
-        "Task", "Policy", "Steps", "Failed", "Not finite", "Jumped", *RUNGS, "Median [us]", "99.9 % [us]",
-        "Worst [ms]", "Worst, clock [ms]", "Mean change [K]", "Largest [K]",
+        "Task", "Policy", "Steps", "Failed", "Not finite", "Jumped", *(rung.name.lower() for rung in RUNGS), "Median [us]",
+        "99.9 % [us]", "Worst [ms]", "Worst, clock [ms]", "Mean change [K]", "Largest [K]", "Least stable",
     ]  # fmt: skip
     worst = max(runs, key=lambda r: r.cpu.max())
     slow = sum(int((r.cpu >= LIMIT).sum()) for r in runs)
@@ -323,14 +344,16 @@ def report(runs: Sequence[Run]) -> str:
             f"policy: {sum(len(r.failed) for r in runs)} solves failed, {sum(int((~r.finite).sum()) for r in runs)} steps left "
             f"a number that is not finite, {sum(r.jumps for r in runs)} times the arm left its branch of equilibria. The "
             f"slowest solve took {1e3 * worst.cpu.max():.1f} ms ({worst.task}, {worst.policy}); {slow} took "
-            f"{1e3 * LIMIT:g} ms or longer.",
+            f"{1e3 * LIMIT:g} ms or longer. Of {sum(r.stability.size for r in runs)} states, random ones and all those after "
+            f"a rung beyond substeps, the least stable one has a stability of {min(r.stability.min() for r in runs):.1g}.",
             "Episodes are as long as the tasks', and a failure ends one. Policies: random powers, drawn uniformly every step; "
             f"bang-bang: full power or none, drawn every step and in half of the lanes held for up to {max(SPANS)} steps; all "
             f"on and all off, every {CYCLE} steps anew after up to {LONGEST_START} steps of full power for some TCAs and none "
             "for others; adversary: full power or none for each TCA until the temperatures hardly change any more, then the "
-            "powers that change them most, until every combination has followed every other. Times are those of a solve alone, on the "
-            "processor; those on the clock hold whatever else the machine did. The change is that of all temperatures in a "
-            "step (Euclidean norm). torture.csv has the temperatures of the slowest solves.",
+            "powers that change them most, until every combination has followed every other, now and then the largest steps "
+            "that go on and on. warm to descent: which rung of the solver's ladder answered. Times are those of a solve alone, "
+            "on the processor; those on the clock hold whatever else the machine did. The change is that of all temperatures "
+            "in a step (Euclidean norm). torture.csv has the temperatures of the slowest solves and of failures.",
             output.markdown_table(header, rows),
             "",
         ]
