@@ -192,7 +192,7 @@ def test_info_says_the_same_as_the_observation(env):
         if action is not None:
             observation, _, _, _, info = env.step(action)
         assert set(info) == keys
-        assert set(info["solver"]) == {"converged", "residual", "iterations"}
+        assert set(info["solver"]) == {"converged", "residual", "iterations", "rung", "jumped"}
         distance = np.linalg.norm(observation["achieved_goal"][:3].astype(float) - observation["desired_goal"][:3])
         assert info["distance_mm"] == pytest.approx(10.0 * distance, abs=1e-9)
         reward = gym.make(f"{env.spec.id.removesuffix('-v0').removesuffix('Dense')}-v0").unwrapped.compute_reward(

@@ -25,6 +25,7 @@ from tca_envs.mechanics.collocation import (
     SUBSTEPS,
     WARM,
     Model,
+    compile_kernels,
     linearise,
     solve_lanes,
 )
@@ -40,7 +41,6 @@ RUNGS = {
     SUBSTEPS: "substeps in drive and load",
     FINER: "substeps on a finer grid",
     DESCENT: "a fall from the end of the start's branch",
-    CLOSED_FORM: "closed form, for nothing loads the arm",
 }
 STRAIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -401,7 +401,7 @@ class Arm:
         payload : Payload, optional
             What hangs from the tip instead of the arm's own payload.
         time_limit_s : float
-            A solve that takes longer is given up [s].
+            A solve that takes longer is given up [s]; the compiling of the kernels at the very first one does not count.
 
         Returns
         -------
@@ -420,18 +420,19 @@ class Arm:
         then substeps in drive and load; then those on a finer grid; then, where the branch ends, the fall down the hill of the
         total energy, and on from there. See `collocation.newton`, `collocation.solve` and `ladder`.
         """
-        begun = time.perf_counter()
         drive = self.checked_drive(drive)
         load = self.load(tip_force, tip_moment, payload)
-        time_limit_s = check.scalar("time_limit_s", time_limit_s, 0.0, above=True)
+        if time_limit_s is not TIME_LIMIT_S:
+            time_limit_s = check.scalar("time_limit_s", time_limit_s, 0.0, above=True)
         lane = Lane(*(self.unloaded() if start is None else self.restart(start)))
         tip, lengths, report = EYE.copy(), np.empty((1, drive.size)), np.empty((1, REPORT))
         asked = (drive[np.newaxis], load[np.newaxis])
         on, message = self, ""
         if not (self.unstressed(load) and self._closed_form(lane, *asked, tip, lengths, report)):
-            here = lane
-            lane = Lane(*(values.copy() for values in here))
-            solve_lanes(self.model, *(values[np.newaxis] for values in lane), *asked, tip, lengths, report)
+            compile_kernels()
+            begun, here, lane = time.perf_counter(), lane, Lane(*(values.copy() for values in lane))
+            known = Lane(*(values[np.newaxis] for values in lane))
+            solve_lanes(self.model, *known, *asked, tip, lengths, report)
             if report[0, 0] == FAILED:
                 climbed = ladder.climb(self, here, lane, drive, load, begun + time_limit_s)
                 message, on, lane = climbed.message, climbed.arm, climbed.lane
@@ -443,6 +444,8 @@ class Arm:
             ends, _, position, _, _, lengths[0] = on.shape(lane)
             tip[0] = pose(ends[-1], position[-1])
             message = f"no equilibrium found: Newton does not go straight to one; {message}; this is the start's shape"
+        elif rung == CLOSED_FORM:
+            message = "closed form: nothing loads the arm"
         elif rung == WARM:
             message = self._found
         else:

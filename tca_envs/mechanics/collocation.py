@@ -19,6 +19,7 @@ Indices: k module, e element, j node of an element, g node of the arm, i muscle 
 Loads are one flat array, see `LOAD`. All matrices are small, so loops are written out: they beat library calls here.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -50,7 +51,7 @@ from tca_envs.mechanics.algebra import (
     scalar_matrix,
     transpose,
 )
-from tca_envs.mechanics.muscle import TENDON, elongation, pull, stored
+from tca_envs.mechanics.muscle import PARAMETERS, TENDON, elongation, pull, stored
 
 Array = NDArray[np.float64]
 
@@ -825,6 +826,21 @@ def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip,
     _solve_lanes(*model, strain, tension, from_drive, from_load, drive, load, budget(model), tip, lengths, report)
 
 
+@cache
+def compile_kernels():
+    """Compile the kernels or load them from the cache, so that this is no part of the time of a solve."""
+    one, none = np.ones(1, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    straight, drive, load = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]), np.zeros(0), np.zeros(LOAD)
+    model = Model(
+        one, one, np.ones(1), np.full((1, 1, 1), 0.5), np.ones((1, 1)), np.ones((1, 6)), straight, np.zeros(2, dtype=np.int64),
+        np.zeros((1, 0, 4)), np.zeros(1), none, np.zeros((0, PARAMETERS)), np.zeros(0), 1e-6, True,
+    )  # fmt: skip
+    linearise(model, straight, drive, drive, load, 0.0, False, SHAPE, straight)
+    drives, loads = np.zeros((1, 0)), np.zeros((1, LOAD))
+    known = (straight[np.newaxis], drives.copy(), drives.copy(), loads.copy())
+    solve_lanes(model, *known, drives, loads, np.eye(4)[np.newaxis].copy(), drives.copy(), np.zeros((1, REPORT)))
+
+
 def budget(model):
     """Return the Newton iterations after which `solve_lanes` gives a lane up, so that someone can look at the clock."""
     return max(MAX_ITERATIONS, WORK // len(model.mass_below))
@@ -916,7 +932,7 @@ def linearise(model, strain, tension, drive, load, damping, slaved, ask, given):
     n = tension.size
     numbers = np.zeros(9)
     columns = n if ask == JACOBIAN else (1 if ask >= STEP else 0)
-    tips = np.zeros((6, max(columns, 1)))
+    tips = np.zeros((6, columns))
     worst = total = np.inf
     for again in range(2 if slaved else 1):
         worst, total = evaluate(model, strain, tension, drive, load, again > 0, ws)

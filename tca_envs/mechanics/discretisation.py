@@ -12,7 +12,7 @@ Everything is deterministic: costs are counted, not timed.
 """
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import ceil
 from typing import NamedTuple
@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tca_envs.mechanics import check
+from tca_envs.mechanics import check, ladder
 from tca_envs.mechanics.arm import MAX_NODES, Arm, Grid, Module, carried
-from tca_envs.mechanics.collocation import FAILED, LOAD, REPORT, Model, solve_lanes
+from tca_envs.mechanics.collocation import FAILED, LOAD, REPORT, solve_lanes
 
 Array = NDArray[np.float64]
 
@@ -143,7 +143,7 @@ def _hardest(arm: Arm, drive: Array, load: Array) -> Known:
     coarse, middling = [Grid(e, 5 if e == 1 else 4) for e in elements], [Grid(e, 7 if e == 1 else 6) for e in elements]
     rough = _on(arm, coarse, 1e-3)
     start = (np.tile(x, (len(drive), *[1] * x.ndim)) for x in rough.unloaded())
-    first = _solve(rough, rough.model, drive, load, *start)
+    first = _solve(rough, ladder.solve, drive, load, *start)
     known = _carried(first.some(first.found), _on(arm, middling, 1e-6))
     known = known.some(known.found)
     # Both to the same small residual, so that the grids alone make the difference.
@@ -202,14 +202,18 @@ def _carried(known: Known, arm: Arm, off: float = 0.0) -> Known:
     strain = carried(known.arm.grids, known.strain, arm.grids)
     if off:
         strain -= off * (strain - arm.unloaded()[0])
-    straight = arm.model._replace(ladder=False)
     start = (strain, known.tension.copy(), known.drive.copy(), known.load.copy())
-    return _solve(arm, straight, known.drive, known.load, *start)
+    return _solve(arm, _straight, known.drive, known.load, *start)
+
+
+def _straight(arm: Arm, *lanes: Array) -> None:
+    solve_lanes(arm.model._replace(ladder=False), *lanes)
 
 
 def _solve(
-    arm: Arm, model: Model, drive: Array, load: Array, strain: Array, tension: Array, from_drive: Array, from_load: Array
-) -> Known:
+    arm: Arm, solver: Callable[..., None], drive: Array, load: Array, strain: Array, tension: Array, from_drive: Array,
+    from_load: Array,
+) -> Known:  # fmt: skip
     tip, lengths, report = np.tile(np.eye(4), (len(drive), 1, 1)), np.empty_like(drive), np.empty((len(drive), REPORT))
-    solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report)
+    solver(arm, strain, tension, from_drive, from_load, drive, load, tip, lengths, report)
     return Known(arm, drive, load, strain, tension, tip[:, :3, 3], report[:, 0] != FAILED)

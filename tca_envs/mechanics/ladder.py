@@ -26,6 +26,7 @@ from tca_envs.mechanics.collocation import (
     SUBSTEPS,
     Model,
     budget,
+    compile_kernels,
     linearise,
     solve_lanes,
 )
@@ -40,13 +41,16 @@ TIME_LIMIT_S = 1.0
 PAST = 1.0 / 256.0
 """A fall happens so far beyond the end of a branch, as a share of what is left of the way; the next one twice as far."""
 MAX_FALLS = 12
-ALIKE = 1e-2
-"""Strains that differ by less, curvature times length [rad] and stretch, are of the same equilibrium."""
+ALIKE = 0.1
+"""Strains that differ by less, curvature times length [rad] and stretch, are taken for those of the same branch."""
 MAX_DESCENT = 300
 """Steps of one fall."""
 FALL_STEP = 0.3
 """Largest rotation [rad] and change of v in a step of a fall: it stays close to the way of the real, strongly damped arm."""
 FIRST_DAMPING = 0.1
+MOST_DAMPING = 1e8
+COLLAPSED = 0.01
+"""A muscle's path that is shorter, per length of the rod, is about to become a point; there is no tangent then."""
 NUDGE = 0.02
 """An arm that stands on an unstable equilibrium is pushed off it by this rotation [rad], unless it moves as much by itself."""
 MODE_ITERATIONS = 12
@@ -148,6 +152,9 @@ def climb(arm: "Arm", start: Lane, stuck: Lane, drive: Array, load: Array, deadl
         if here.reached or late():
             break
         begun, share = here.lane, min(1.0, PAST * 2.0**fall)
+        if _shortest(finer.model, begun) < COLLAPSED:
+            reasons.append("there a muscle's path shrinks to a point: it collapses the rod")
+            break
         past = (begun.drive + share * (drive - begun.drive), begun.load + share * (load - begun.load))
         fallen, steps = descend(finer.model, begun, *past, late)
         iterations += steps
@@ -155,7 +162,7 @@ def climb(arm: "Arm", start: Lane, stuck: Lane, drive: Array, load: Array, deadl
             reasons.append(f"the fall from {gone(begun)} finds no equilibrium")
             break
         again = _follow(finer.model, fallen, begun.drive, begun.load, deadline)
-        jump = not (again.reached and _alike(finer.model, again.lane, begun))
+        jump = not _alike(finer.model, again.lane, begun)
         jumped |= jump
         reasons.append(f"{'fell' if jump else 'went down'} at {gone(begun)}")
         here = _follow(finer.model, fallen, drive, load, deadline)
@@ -180,6 +187,7 @@ def solve(
     Arguments as of `collocation.solve_lanes`; lanes without an answer are left as they were. An answer on a finer grid is
     carried to the arm's own.
     """
+    compile_kernels()
     start = (strain.copy(), tension.copy(), from_drive.copy(), from_load.copy())
     lanes = (strain, tension, from_drive, from_load)
     solve_lanes(arm.model, *lanes, drive, load, tip, lengths, report)
@@ -192,6 +200,13 @@ def solve(
             answer, tip[i], lengths[i] = found.arm.on(arm, found.lane), found.tip, found.lengths
         for values, new in zip(lanes, answer, strict=True):
             values[i] = new
+
+
+def _shortest(model: Model, lane: Lane) -> float:
+    """Return the smallest |p_a'| of the muscles at the nodes, eq. (13)."""
+    (u_x, u_y, u_z, v_x, v_y, v_z), (x, y, dx, dy) = lane.strain.T[..., np.newaxis], np.moveaxis(model.route, 2, 0)
+    squares = (v_x - u_z * y + dx) ** 2 + (v_y + u_z * x + dy) ** 2 + (v_z + u_x * y - u_y * x) ** 2
+    return float(np.sqrt(squares.min(initial=np.inf)))
 
 
 def _alike(model: Model, one: Lane, other: Lane) -> bool:
@@ -261,6 +276,8 @@ def descend(model: Model, lane: Lane, drive: Array, load: Array, late: Callable[
                 continue
         if index or not np.isfinite(rotation):
             damping = max(4.0 * damping, 1e-3)
+            if damping > MOST_DAMPING:
+                return None, step
             continue
         share = min(1.0, FALL_STEP / max(rotation, 1e-300), FALL_STEP / max(slide, 1e-300))
         trial, pull = strain + share * np.hstack([bend, shear]), tension.copy()
@@ -278,24 +295,20 @@ def descend(model: Model, lane: Lane, drive: Array, load: Array, late: Callable[
 
 
 def _pushed_off(model: Model, strain: Array, tension: Array, drive: Array, load: Array) -> Array:
-    """Return strains (G, 6) a little down the hill from an unstable equilibrium, along its softest mode (inverse iteration)."""
+    """Return strains (G, 6) a little off an unstable equilibrium, along its softest mode, which inverse iteration finds."""
     damping = 0.01
     while negative_eigenvalues(model, strain, tension, drive, load, damping):
         damping *= 2.0
     stiffness = np.repeat(model.stiffness, model.elements * model.nodes, axis=0)
-    mode = np.tile([1.0, 0.7, 0.4, 0.0, 0.0, 0.0], (len(strain), 1))  # no mode of a symmetric arm is orthogonal to it
-    mode[:, :3] *= np.linspace(1.0, 0.5, len(strain))[:, np.newaxis]
+    # A direction that no symmetric arm's softest mode is orthogonal to; so the side to which such an arm falls is settled.
+    mode = np.tile([1.0, 0.27, 0.4, 0.0, 0.0, 0.0], (len(strain), 1)) * np.linspace(1.0, 0.5, len(strain))[:, np.newaxis]
     for _ in range(MODE_ITERATIONS):
         numbers, *_, bend, shear, _ = linearise(
             model, strain, tension.copy(), drive, load, damping, False, GIVEN, -stiffness * mode
         )
         mode = np.hstack([bend, shear])
         mode *= NUDGE / numbers[5]
-    energies = [
-        linearise(model, strain + sign * mode, tension.copy(), drive, load, 0.0, True, SHAPE, strain)[0][2]
-        for sign in (1.0, -1.0)
-    ]
-    return strain + mode if energies[0] <= energies[1] else strain - mode
+    return strain + mode
 
 
 def negative_eigenvalues(model: Model, strain: Array, tension: Array, drive: Array, load: Array, damping: float = 0.0) -> int:
