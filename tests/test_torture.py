@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from tca_envs.mechanics import ladder
+from tca_envs.mechanics import Rung, ladder
 from tca_envs.study import torture
 from tca_envs.tasks import TASKS, core
 from tca_envs.tasks.reach import Reach
@@ -71,6 +71,13 @@ def test_the_adversary_sets_hot_against_cold(histories):
     assert len(extremes(histories["random"])) == 1
 
 
+def test_the_adversary_takes_the_largest_steps_first(monkeypatch):
+    monkeypatch.setattr(torture, "GREEDY", 0.0)
+    act = torture.adversary(np.random.default_rng(0), torture.LANES, 4, 4)
+    heated = (act(Heated(TASKS["twist-align"]("train", 1e-5)), np.zeros(torture.LANES, dtype=int)) > 0.0).sum(axis=1)
+    assert heated.tolist() == [4, 3, 3, 3, 3, 2, 2, 2, 2, 2]
+
+
 def test_all_on_and_all_off_go_on_to_their_ends_from_random_states(histories):
     for name, end in (("all-on", 158.0), ("all-off", 29.9)):
         cycles = histories[name].reshape(-1, torture.CYCLE, torture.LANES, 4)
@@ -105,11 +112,30 @@ def test_a_broken_solver_is_found_out(monkeypatch, no_goals):
 
     monkeypatch.setattr(ladder, "solve", gives_up)
     run = torture.drive("reach", "all-on", 400)
-    assert 400 - run.rungs.sum() == len(run.failed) > 20
+    assert 400 - run.rungs.sum() == len(run.failed)
+    assert 20 < len(run.failed) <= 100
     for start, end, payload in run.failed:
         assert end.max() > 60.0 >= start.max() > 49.0 and payload == 2.1e-3
     assert int(torture.row(run)[torture.HEADER.index("failed")]) == len(run.failed)
     assert f"{len(run.failed)} solves failed" in torture.report([run])
+
+
+def test_falls_are_counted_and_looked_at(monkeypatch):
+    """One TCA alone: near 145 degC the arm buckles, in each lane once."""
+    monkeypatch.setitem(torture.POLICIES, "one", lambda rng, lanes, *_: lambda core, age: np.tile([1.0, -1, -1], (lanes, 1)))
+    run = torture.drive("reach", "one", 30 * torture.LANES)
+    assert run.jumps == run.rungs[torture.RUNGS.index(Rung.DESCENT)] == torture.LANES
+    assert run.stability.size >= 30 + torture.LANES - 1 and 0.0 < run.stability.min() < 0.5
+    assert f"{torture.LANES} times the arm left its branch" in torture.report([run])
+
+
+def test_stability_is_that_of_the_equilibrium():
+    lanes = TASKS["reach"]("train", 1e-5).core(2)
+    for _ in range(10):
+        lanes.step(np.array([[1.0, -1.0, -1.0], [-1.0, 1.0, 0.0]]))
+    for lane, temperature in enumerate(lanes.record.temperature):
+        expected = lanes.arm.equilibrium(temperature).stability
+        assert 0.0 < expected < 1.0 and torture.stability_of(lanes, lane) == pytest.approx(expected, abs=1e-4)
 
 
 def test_numbers_that_are_not_finite_are_found(monkeypatch, no_goals):
