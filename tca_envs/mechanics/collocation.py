@@ -66,8 +66,11 @@ MAX_SHEAR_STEP = 0.5
 CONTRACTION = 0.5
 ROUND_OFF = 1e-8
 """A step that is shorter need not contract."""
-SAFE = 0.02
-"""Old factors certify stability where their pivots over the rod's stiffness are above this; an unloaded rod's are 0.29."""
+NEAR = 0.01
+"""Factors are taken anew after a step that turns a section by more [rad]."""
+SAFE = 0.1
+"""Factors of the last step certify stability where their pivots over the rod's stiffness are above this; an unloaded rod's are
+0.29. Within NEAR they change by much less."""
 NEUTRAL = 1e-5
 """Smallest eigenvalues of the tangent (see `ladder.smallest_eigenvalue`) above minus this are neutral, not unstable: an arm
 that can turn about an axis of symmetry without any work has a zero among them, up to the grid's error. Newton adds so many
@@ -728,18 +731,20 @@ def newton(model, strain, tension, drive, load, moved, ws):
         converged (bool), dimensionless residual, iterations.
     """
     worst = size = np.inf
-    margin, iterations = 0.0, 0
+    margin = since = 0.0
+    iterations = 0
     while True:
         before = worst
         worst, _ = evaluate(model, strain, tension, drive, load, iterations > 0, ws)
         there = worst < model.tolerance and (iterations > 0 or not moved)
-        if there and margin > SAFE:
+        if there and margin > SAFE and since <= NEAR:
             return True, worst, iterations
         if not worst < np.inf or (iterations == MAX_ITERATIONS and not there):
             return False, worst, iterations
         # Near the answer a step with old factors gains almost as much as one with new ones, at a third of the cost.
-        if there or not worst < REUSE * before or before == np.inf:
+        if there or since > NEAR or not worst < REUSE * before or before == np.inf:
             index, margin = eliminate(model, strain, tension, load, NEUTRAL, ws)
+            since = 0.0
             if there:
                 return index == 0, worst, iterations
         rotation, shear = substitute(model, ws)
@@ -747,6 +752,7 @@ def newton(model, strain, tension, drive, load, moved, ws):
         if not (rotation < MAX_ROTATION_STEP and shear < MAX_SHEAR_STEP and (size < CONTRACTION * last or size < ROUND_OFF)):
             return False, worst, iterations
         iterations += 1
+        since += size
         for g in range(strain.shape[0]):
             put3(strain, g, 0, axpy(1.0, get3(ws.bend, g, 0), get3(strain, g, 0)))
             put3(strain, g, 3, axpy(1.0, get3(ws.shear, g, 0), get3(strain, g, 3)))
