@@ -46,8 +46,8 @@ LIMIT = 20e-3
 """Longest time that a solve may take [s]: a fifth of a step."""
 RUNGS = (Rung.WARM, Rung.SUBSTEPS, Rung.FINER, Rung.DESCENT)
 """Of the ladder: those that can answer where the arm is loaded."""
-SAMPLE = 500
-"""States of a run whose stability is looked at, at least; beside those that the upper rungs found."""
+SAMPLED = 25
+"""One in so many rounds ends with a look at the stability of one lane; states that upper rungs found are all looked at."""
 
 
 # Policies
@@ -262,10 +262,8 @@ def drive(name: str, policy: str, steps: int, progress: Callable[[Iterable[int]]
     change: list[Array] = []
     finite: list[NDArray[np.bool_]] = []
     stability: list[float] = []
-    rounds = -(-steps // LANES)
-    sampled = set(np.linspace(0, rounds - 1, SAMPLE).astype(int).tolist())
     with no_collection():
-        for i in progress(range(rounds)):
+        for i in progress(range(-(-steps // LANES))):
             drawn = rng.integers(0, GOALS, over.sum())
             core.reset(np.flatnonzero(over), goals[drawn], scenes[drawn])
             age[over] = 0
@@ -277,7 +275,7 @@ def drive(name: str, policy: str, steps: int, progress: Callable[[Iterable[int]]
             numbers = [task.observe(core), *(getattr(record, f.name) for f in fields(Record))]
             finite.append(np.all([np.isfinite(n.reshape(LANES, -1)).all(axis=1) for n in numbers], axis=0))
             rare = np.isin(told[:, 0], (Rung.FINER, Rung.DESCENT))
-            if i in sampled:
+            if i % SAMPLED == 0:
                 rare[rng.integers(LANES)] = True
             stability += [stability_of(core, lane) for lane in np.flatnonzero(rare).tolist()]
     assert core.slowest is not None
