@@ -70,7 +70,11 @@ def test_the_arm_hangs_straight_at_the_start_and_bends_towards_a_hot_tca():
     env = gym.make("TCAReach-v0")
     observation, _ = env.reset(seed=0)
     np.testing.assert_allclose(observation["achieved_goal"][:2], 0.0, atol=1e-6)
-    for _ in range(50):
+    for _ in range(12):
         observation, *_ = env.step(np.array([1.0, -1.0, -1.0], np.float32))
     x, y, z = observation["achieved_goal"]
-    assert x > 0.5 and abs(y) < 1e-4 and z < 4.5
+    assert x > 0.4 and abs(y) < 1e-4 and z < 4.6
+    for _ in range(40):
+        observation, *_ = env.step(np.array([1.0, -1.0, -1.0], np.float32))
+    x, y, z = observation["achieved_goal"]
+    assert x > 0.8 and abs(y) > 0.05, "above about 145 degC it buckles to a side"

@@ -27,7 +27,7 @@ CASES = {
     "bending": (bending_arm(), [25.0, 120.0, 90.0], {}),
     "whole": (whole_arm(), [80.0, 40.0, 25.0, 110.0], {}),
     "whole, loaded": (whole_arm(), [60.0, 25.0, 25.0, 60.0], {"tip_force": (1e-3, 0.0, -2e-3), "payload": Payload(2e-3)}),
-    "heavy": (Arm([bending_module()], GRAVITY, Payload(8e-3, BELOW_BENDING.centre)), [150.0, 25.0, 25.0], {}),
+    "heavy": (Arm([bending_module()], GRAVITY, Payload(8e-3, BELOW_BENDING.centre)), [120.0, 25.0, 25.0], {}),
     "mixed": (mixed_arm(), [0.1, 90.0, 0.04, 80.0, 0.05], {"tip_force": (0.002, 0.003, 0.0)}),
     "no muscles": (Arm([Module.cylinder(0.1, 0.009, 0.125e6, 4e4, 6e-3)], (9.81, 0.0, 0.0)), [], {}),
 }

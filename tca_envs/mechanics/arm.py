@@ -430,10 +430,11 @@ class Arm:
         on, message = self, ""
         if not (self.unstressed(load) and self._closed_form(lane, *asked, tip, lengths, report)):
             compile_kernels()
-            begun, here, lane = time.perf_counter(), lane, Lane(*(values.copy() for values in lane))
+            begun = time.perf_counter()
             known = Lane(*(values[np.newaxis] for values in lane))
             solve_lanes(self.model, *known, *asked, tip, lengths, report)
             if report[0, 0] == FAILED:
+                here = Lane(*(self.unloaded() if start is None else self.restart(start)))
                 climbed = ladder.climb(self, here, lane, drive, load, begun + time_limit_s)
                 message, on, lane = climbed.message, climbed.arm, climbed.lane
                 tip[0], lengths[0], iterations = climbed.tip, climbed.lengths, report[0, 2] + climbed.iterations

@@ -763,7 +763,7 @@ def newton(model, strain, tension, drive, load, moved, ws):
 
 
 @inner
-def solve(model, strain, tension, from_drive, from_load, drive, load, budget, ws):
+def solve(model, strain, tension, from_drive, from_load, drive, load, first, budget, ws):
     """Follow the branch of equilibria from a known one to the asked one, in place.
 
     Newton from the known state first; its first step is the tangent's prediction. Where it fails, drive and load go from the
@@ -773,12 +773,13 @@ def solve(model, strain, tension, from_drive, from_load, drive, load, budget, ws
     Returns
     -------
     tuple
-        rung (WARM, SUBSTEPS or FAILED), dimensionless residual, Newton iterations in all.
+        rung (WARM, SUBSTEPS or FAILED), dimensionless residual, Newton iterations in all, next substep as a share of what is
+        left of the way.
     """
     first_drive, first_load = from_drive.copy(), from_load.copy()
     good_strain, good_tension = strain.copy(), tension.copy()
     drive_now, load_now = drive.copy(), load.copy()
-    done, step, spent, rung, moved = 0.0, 1.0, 0, WARM, False
+    done, step, spent, rung, moved = 0.0, first, 0, WARM if first == 1.0 else SUBSTEPS, False
     for i in range(drive.size):
         moved |= drive[i] != from_drive[i]
     for i in range(load.size):
@@ -795,7 +796,7 @@ def solve(model, strain, tension, from_drive, from_load, drive, load, budget, ws
             from_drive[:] = drive_now
             from_load[:] = load_now
             if here == 1.0:
-                return rung, worst, spent
+                return rung, worst, spent, 1.0
             done, step = here, 2.0 * step
             good_strain[:] = strain
             good_tension[:] = tension
@@ -805,10 +806,10 @@ def solve(model, strain, tension, from_drive, from_load, drive, load, budget, ws
         step = FIRST_SUBSTEP if rung == WARM else 0.5 * step
         rung = SUBSTEPS
         if step < SMALLEST_SUBSTEP or spent >= budget or not model.ladder:
-            return FAILED, worst, spent
+            return FAILED, worst, spent, min(0.5, step / (1.0 - done))
 
 
-def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report):
+def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, first=1.0):
     """Follow the branches of N arms of one model, each from its own known equilibrium.
 
     Parameters
@@ -826,10 +827,13 @@ def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip,
     lengths : (N, n) array
         Out: path lengths [m]; unchanged where there was no answer.
     report : (N, REPORT) array
-        Out: rung (WARM, SUBSTEPS or FAILED), dimensionless residual, Newton iterations, jumped (0). A lane is given up after
-        `budget` iterations.
+        Out: rung (WARM, SUBSTEPS or FAILED), dimensionless residual, Newton iterations, and: jumped (0); of a lane that
+        FAILED, the substep to go on with. Such a lane is at the end of its branch (the substep is below SMALLEST_SUBSTEP) or
+        has done `budget` iterations.
+    first : float
+        Substep to begin with, as a share of the way: 1 but for a lane that goes on.
     """
-    _solve_lanes(*model, strain, tension, from_drive, from_load, drive, load, budget(model), tip, lengths, report)
+    _solve_lanes(*model, strain, tension, from_drive, from_load, drive, load, first, budget(model), tip, lengths, report)
 
 
 @cache
@@ -855,7 +859,7 @@ def budget(model):
 @entry
 def _solve_lanes(
     elements, nodes, length, a, b, stiffness, reference, first_muscle, route, mass_below, kind, parameters, rest_length,
-    tolerance, ladder, strain, tension, from_drive, from_load, drive, load, budget, tip, lengths, report,
+    tolerance, ladder, strain, tension, from_drive, from_load, drive, load, first, budget, tip, lengths, report,
 ):  # fmt: skip
     """`solve_lanes` with the model's fields one by one: of a NamedTuple Numba works out the type anew at every call."""
     model = Model(
@@ -864,11 +868,12 @@ def _solve_lanes(
     )  # fmt: skip
     ws = workspace(model)
     for lane in range(strain.shape[0]):
-        rung, worst, iterations = solve(
-            model, strain[lane], tension[lane], from_drive[lane], from_load[lane], drive[lane], load[lane], budget, ws
+        rung, worst, iterations, step = solve(
+            model, strain[lane], tension[lane], from_drive[lane], from_load[lane], drive[lane], load[lane], first, budget, ws
         )
         report[lane, 0], report[lane, 1], report[lane, 2], report[lane, 3] = rung, worst, iterations, 0.0
         if rung == FAILED:
+            report[lane, 3] = step
             continue
         r = rotation_matrix(get4(ws.ends, ws.ends.shape[0] - 1))
         pose = tip[lane]

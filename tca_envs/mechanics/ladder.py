@@ -22,10 +22,10 @@ from tca_envs.mechanics.collocation import (
     NEUTRAL,
     REPORT,
     SHAPE,
+    SMALLEST_SUBSTEP,
     STEP,
     SUBSTEPS,
     Model,
-    budget,
     compile_kernels,
     linearise,
     solve_lanes,
@@ -220,13 +220,16 @@ def _follow(model: Model, lane: Lane, drive: Array, load: Array, deadline: float
     """Follow a branch by the compiled ladder, as far as it goes before the deadline."""
     strain, tension, from_drive, from_load = (values[np.newaxis].copy() for values in lane)
     tip, lengths, report = np.eye(4)[np.newaxis], np.empty((1, drive.size)), np.empty((1, REPORT))
-    iterations, chunk = 0, budget(model)
-    while True:
+    iterations, step = 0, 1.0
+    while step >= SMALLEST_SUBSTEP:
         begun = time.perf_counter()
-        solve_lanes(model, strain, tension, from_drive, from_load, drive[np.newaxis], load[np.newaxis], tip, lengths, report)
+        solve_lanes(
+            model, strain, tension, from_drive, from_load, drive[np.newaxis], load[np.newaxis], tip, lengths, report, step
+        )
         iterations += int(report[0, 2])
+        step = float(report[0, 3])
         now = time.perf_counter()
-        if report[0, 0] != FAILED or report[0, 2] < chunk or now + (now - begun) > deadline:
+        if report[0, 0] != FAILED or not model.ladder or now + (now - begun) > deadline:
             break
     here = Lane(strain[0], tension[0], from_drive[0], from_load[0])
     return _Followed(bool(report[0, 0] != FAILED), here, tip[0], lengths[0], float(report[0, 1]), iterations)
