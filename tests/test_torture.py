@@ -133,9 +133,14 @@ def test_stability_is_that_of_the_equilibrium():
     lanes = TASKS["reach"]("train", 1e-5).core(2)
     for _ in range(10):
         lanes.step(np.array([[1.0, -1.0, -1.0], [-1.0, 1.0, 0.0]]))
-    for lane, temperature in enumerate(lanes.record.temperature):
+    record = lanes.record
+    for lane, temperature in enumerate(record.temperature):
         expected = lanes.arm.equilibrium(temperature).stability
         assert 0.0 < expected < 1.0 and torture.stability_of(lanes, lane) == pytest.approx(expected, abs=1e-4)
+    # What is no equilibrium on this grid is looked at on a finer one.
+    record.strain[1, :, 0] += 5.0
+    finer = lanes.arm.finer.equilibrium(record.temperature[1]).stability
+    assert abs(finer - expected) > 1e-3 and torture.stability_of(lanes, 1) == pytest.approx(finer, abs=1e-4)
 
 
 def test_numbers_that_are_not_finite_are_found(monkeypatch, no_goals):

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from tca_envs import presets
 from tca_envs.mechanics import Rung, ladder, thermal
+from tca_envs.mechanics.collocation import REPORT, SHAPE, linearise, solve_lanes
+from tca_envs.mechanics.ladder import Lane
 from tca_envs.study import output
 from tca_envs.study.scenes import IDS
 from tca_envs.study.timing import no_collection
@@ -286,11 +288,18 @@ def drive(name: str, policy: str, steps: int, progress: Callable[[Iterable[int]]
 
 
 def stability_of(core: Core, lane: int) -> float:
-    """Return `Equilibrium.stability` of the state in which a lane is."""
-    record = core.record
-    return ladder.smallest_eigenvalue(
-        core.arm.model, record.strain[lane], record.tension[lane], record.drive[lane], record.load[lane]
-    )
+    """Return `Equilibrium.stability` of the state in which a lane is, on the grid on which it was found."""
+    arm, record = core.arm, core.record
+    state = Lane(record.strain[lane], record.tension[lane], record.drive[lane], record.load[lane])
+    here = linearise(arm.model, state.strain, state.tension.copy(), *state[2:], 0.0, False, SHAPE, state.strain)
+    if here[0][0] > arm.model.tolerance:
+        # The answer is that of a finer grid, carried to this one.
+        strain, tension, drive, load = (values[np.newaxis].copy() for values in arm.on(arm.finer, state))
+        tip, lengths, report = np.eye(4)[np.newaxis], np.empty_like(tension), np.empty((1, REPORT))
+        solve_lanes(arm.finer.model, strain, tension, drive, load, drive.copy(), load.copy(), tip, lengths, report)
+        if solved(report).all():
+            return ladder.smallest_eigenvalue(arm.finer.model, strain[0], tension[0], drive[0], load[0])
+    return ladder.smallest_eigenvalue(arm.model, *state)
 
 
 # What is written
