@@ -11,7 +11,7 @@ import pytest
 import tca_envs  # noqa: F401
 from tca_envs import presets
 from tca_envs.mechanics import TCA, Arm, Grid, Module, Muscle, Payload, Spring, Tendon, discretisation, discretise
-from tca_envs.mechanics.arm import default_grid, interpolation
+from tca_envs.mechanics.arm import default_grid, interpolated
 from tca_envs.mechanics.thermal import AMBIENT
 from tca_envs.tasks.core import CUT_OFF
 
@@ -180,7 +180,7 @@ def test_interpolation_between_grids_is_exact_for_polynomials():
     x, y = (((np.arange(e)[:, None] + 0.5 + 0.5 * np.polynomial.legendre.leggauss(q)[0]) / e).ravel() for e, q in (here, there))
     values = np.column_stack([x**3 - x, np.ones_like(x)])
     expected = np.column_stack([y**3 - y, np.ones_like(y)])
-    np.testing.assert_allclose(interpolation(here, there) @ values, expected, atol=1e-14)
+    np.testing.assert_allclose(interpolated(here, values, there), expected, atol=1e-14)
 
 
 # Without load: the closed form.

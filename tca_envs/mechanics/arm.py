@@ -188,6 +188,10 @@ class Grid(NamedTuple):
 
 
 MAX_NODES = 16
+FINE_ENOUGH = 1000
+"""Nodes of an arm beyond which `Arm.finer` is no finer."""
+MOST_NODES = 10_000
+"""Of an arm; an iteration of Newton takes some tens of milliseconds then."""
 
 
 @dataclass(frozen=True)
@@ -249,19 +253,24 @@ def integrals(c: Array, x: Array) -> Array:
 
 
 @cache
-def interpolation(here: Grid, there: Grid) -> Array:
-    """Return the matrix (G', G) that takes values at the nodes of one grid of a module to those of another.
+def interpolation(here: Grid, there: Grid) -> tuple[NDArray[np.int64], Array]:
+    """Return what takes values at the nodes of one grid of a module to those of another, `interpolated`.
 
-    By the Lagrange polynomials of the element that a node lies in.
+    Nodes (G', q) of the element that each new node lies in, and the values of their Lagrange polynomials there (G', q).
     """
     vandermonde = np.polynomial.legendre.legvander
     x = ((np.arange(there.elements)[:, np.newaxis] + gauss(there.nodes)[2]) / there.elements * here.elements).ravel()
-    element = np.minimum(x.astype(int), here.elements - 1)
+    element = np.minimum(x.astype(np.int64), here.elements - 1)
     basis = vandermonde(2.0 * gauss(here.nodes)[2] - 1.0, here.nodes - 1)
-    weights = np.linalg.solve(basis.T, vandermonde(2.0 * (x - element) - 1.0, here.nodes - 1).T).T
-    result = np.zeros((len(x), here.elements, here.nodes))
-    result[np.arange(len(x)), element] = weights
-    return result.reshape(len(x), -1)
+    values = vandermonde(2.0 * (x - element) - 1.0, here.nodes - 1)
+    weights = np.asarray(np.linalg.solve(basis.T, values.T).T, dtype=np.float64)
+    return element[:, np.newaxis] * here.nodes + np.arange(here.nodes), weights
+
+
+def interpolated(here: Grid, values: Array, there: Grid) -> Array:
+    """Return values (..., G, d) at the nodes of one grid of a module interpolated to those of another, (..., G', d)."""
+    nodes, weights = interpolation(here, there)
+    return np.einsum("gq,...gqd->...gd", weights, values[..., nodes, :])
 
 
 def carried(here: Sequence[Grid], strain: Array, there: Sequence[Grid]) -> Array:
@@ -269,7 +278,7 @@ def carried(here: Sequence[Grid], strain: Array, there: Sequence[Grid]) -> Array
     parts, first = [], 0
     for old, new in zip(here, there, strict=True):
         last = first + old.elements * old.nodes
-        parts.append(interpolation(old, new) @ strain[..., first:last, :])
+        parts.append(interpolated(old, strain[..., first:last, :], new))
         first = last
     return np.concatenate(parts, axis=-2)
 
@@ -324,6 +333,9 @@ class Arm:
         self.gravity = check.array("gravity", gravity, (3,))
         self.payload = payload
         self.grids = tuple(default_grid(m) for m in self.modules) if grids is None else _checked(grids, len(self.modules))
+        nodes = sum(elements * q for elements, q in self.grids)
+        if nodes > MOST_NODES:
+            raise ValueError(f"grids = {self.grids!r}: expected at most {MOST_NODES} nodes in all, got {nodes}")
         self.residual_tolerance = check.scalar("residual_tolerance", residual_tolerance, 1e-12, 1e-1)
         self.length = sum(module.length for module in self.modules)
         self.muscles = tuple(muscle for module in self.modules for muscle in module.muscles)
@@ -352,13 +364,15 @@ class Arm:
 
     @cached_property
     def finer(self) -> "Arm":
-        """The same arm with twice the elements."""
+        """The same arm with twice the elements, unless they are many already."""
+        if len(self.node_arc) > FINE_ENOUGH:
+            return self
         grids = [Grid(2 * elements, nodes) for elements, nodes in self.grids]
         return Arm(self.modules, self.gravity, self.payload, grids, self.residual_tolerance)
 
     def on(self, other: "Arm", lane: Lane) -> Lane:
         """Return an equilibrium of this arm on the grids of another one with the same modules."""
-        return lane._replace(strain=carried(self.grids, lane.strain, other.grids))
+        return lane if other is self else lane._replace(strain=carried(self.grids, lane.strain, other.grids))
 
     def load(self, tip_force: ArrayLike = ZERO, tip_moment: ArrayLike = ZERO, payload: Payload | None = None) -> Array:
         """Return the external load as the flat array of `collocation.LOAD` numbers that the kernels read."""
@@ -435,7 +449,7 @@ class Arm:
             solve_lanes(self.model, *known, *asked, tip, lengths, report)
             if report[0, 0] == FAILED:
                 here = Lane(*(self.unloaded() if start is None else self.restart(start)))
-                climbed = ladder.climb(self, here, lane, drive, load, begun + time_limit_s)
+                climbed = ladder.climb(self, here, lane, drive, load, report[0, 3], begun, time_limit_s)
                 message, on, lane = climbed.message, climbed.arm, climbed.lane
                 tip[0], lengths[0], iterations = climbed.tip, climbed.lengths, report[0, 2] + climbed.iterations
                 report[0] = climbed.rung, climbed.residual, iterations, climbed.jumped

@@ -767,8 +767,8 @@ def solve(model, strain, tension, from_drive, from_load, drive, load, first, bud
     """Follow the branch of equilibria from a known one to the asked one, in place.
 
     Newton from the known state first; its first step is the tangent's prediction. Where it fails, drive and load go from the
-    known ones to the asked ones in substeps, shortened on failure and doubled on success. Arguments as in `solve_lanes`, for
-    one arm.
+    known ones to the asked ones in substeps, shortened on failure and doubled on success. Arguments as in `solve_lanes`,
+    for one arm.
 
     Returns
     -------

@@ -38,6 +38,8 @@ Array = NDArray[np.float64]
 
 TIME_LIMIT_S = 1.0
 """No solve takes longer [s], unless another limit is asked for."""
+CAREFUL = 1.0 / 32.0
+"""First substep on the finer grid, as a share of what is left of the way."""
 PAST = 1.0 / 256.0
 """A fall happens so far beyond the end of a branch, as a share of what is left of the way; the next one twice as far."""
 MAX_FALLS = 12
@@ -101,7 +103,9 @@ class _Followed(NamedTuple):
     iterations: int
 
 
-def climb(arm: "Arm", start: Lane, stuck: Lane, drive: Array, load: Array, deadline: float) -> Climb:
+def climb(
+    arm: "Arm", start: Lane, stuck: Lane, drive: Array, load: Array, step: float, begun: float, time_limit_s: float
+) -> Climb:
     """Find the equilibrium that the arm comes to beyond the end of what Newton can follow.
 
     Parameters
@@ -112,8 +116,12 @@ def climb(arm: "Arm", start: Lane, stuck: Lane, drive: Array, load: Array, deadl
         Where the way began and how far it went.
     drive, load : (n,), (LOAD,) arrays
         What is asked.
-    deadline : float
-        Of `time.perf_counter` [s].
+    step : float
+        The substep to go on with, see `collocation.solve_lanes`.
+    begun : float
+        When the first rung began, by `time.perf_counter` [s].
+    time_limit_s : float
+        How long all rungs together may take [s].
 
     Returns
     -------
@@ -124,6 +132,8 @@ def climb(arm: "Arm", start: Lane, stuck: Lane, drive: Array, load: Array, deadl
     way = np.concatenate([drive - start.drive, load - start.load])
     unit = way / max(float(way @ way), 1e-300)
     iterations = 0
+    # What may come between two looks at the clock: a call of the compiled rung, on the finer grid.
+    deadline = begun + 0.9 * time_limit_s - 2.0 * (time.perf_counter() - begun)
 
     def gone(lane: Lane) -> str:
         share = unit @ np.concatenate([lane.drive - start.drive, lane.load - start.load])
@@ -135,36 +145,37 @@ def climb(arm: "Arm", start: Lane, stuck: Lane, drive: Array, load: Array, deadl
     def end(rung: int, on: "Arm", found: _Followed, jumped: bool) -> Climb:
         return Climb(rung, on, found.lane, found.tip, found.lengths, found.residual, iterations, jumped, "; ".join(reasons))
 
-    # A long way may only have run out of its budget, or need shorter substeps there.
-    here = _follow(arm.model, stuck, drive, load, deadline)
+    # A long way may only have run out of its budget.
+    here = _follow(arm.model, stuck, drive, load, deadline, step)
     iterations += here.iterations
     if here.reached:
         return end(SUBSTEPS, arm, here, False)
     reasons.append(f"substeps end at {gone(here.lane)}")
     # Where a branch ends, a grid's error decides on much: from here on with less of it.
     finer, rung, jumped = arm.finer, FINER, False
-    here = _follow(finer.model, arm.on(finer, here.lane), drive, load, deadline)
-    iterations += here.iterations
+    if finer is not arm:
+        here = _follow(finer.model, arm.on(finer, here.lane), drive, load, deadline, CAREFUL)
+        iterations += here.iterations
     if not here.reached:
         rung = DESCENT
         reasons.append(f"those on a finer grid at {gone(here.lane)}")
     for fall in range(MAX_FALLS):
         if here.reached or late():
             break
-        begun, share = here.lane, min(1.0, PAST * 2.0**fall)
-        if _shortest(finer.model, begun) < COLLAPSED:
+        edge, share = here.lane, min(1.0, PAST * 2.0**fall)
+        if _shortest(finer.model, edge) < COLLAPSED:
             reasons.append("there a muscle's path shrinks to a point: it collapses the rod")
             break
-        past = (begun.drive + share * (drive - begun.drive), begun.load + share * (load - begun.load))
-        fallen, steps = descend(finer.model, begun, *past, late)
+        past = (edge.drive + share * (drive - edge.drive), edge.load + share * (load - edge.load))
+        fallen, steps = descend(finer.model, edge, *past, late)
         iterations += steps
         if fallen is None:
-            reasons.append(f"the fall from {gone(begun)} finds no equilibrium")
+            reasons.append(f"the fall from {gone(edge)} finds no equilibrium")
             break
-        again = _follow(finer.model, fallen, begun.drive, begun.load, deadline)
-        jump = not _alike(finer.model, again.lane, begun)
+        again = _follow(finer.model, fallen, edge.drive, edge.load, deadline)
+        jump = not _alike(finer.model, again.lane, edge)
         jumped |= jump
-        reasons.append(f"{'fell' if jump else 'went down'} at {gone(begun)}")
+        reasons.append(f"{'fell' if jump else 'went down'} at {gone(edge)}")
         here = _follow(finer.model, fallen, drive, load, deadline)
         iterations += again.iterations + here.iterations
     if not here.reached:
@@ -193,7 +204,7 @@ def solve(
     solve_lanes(arm.model, *lanes, drive, load, tip, lengths, report)
     for i in np.flatnonzero(report[:, 0] == FAILED):
         known, stuck = (Lane(*(values[i].copy() for values in kind)) for kind in (start, lanes))
-        found = climb(arm, known, stuck, drive[i], load[i], time.perf_counter() + TIME_LIMIT_S)
+        found = climb(arm, known, stuck, drive[i], load[i], report[i, 3], time.perf_counter(), TIME_LIMIT_S)
         report[i] = found.rung, found.residual, report[i, 2] + found.iterations, found.jumped
         answer = known
         if found.rung != FAILED:
@@ -216,20 +227,18 @@ def _alike(model: Model, one: Lane, other: Lane) -> bool:
     return bool((apart[:, :3] * span).max() < ALIKE and apart[:, 3:].max() < ALIKE)
 
 
-def _follow(model: Model, lane: Lane, drive: Array, load: Array, deadline: float) -> _Followed:
+def _follow(model: Model, lane: Lane, drive: Array, load: Array, deadline: float, step: float = 1.0) -> _Followed:
     """Follow a branch by the compiled ladder, as far as it goes before the deadline."""
     strain, tension, from_drive, from_load = (values[np.newaxis].copy() for values in lane)
-    tip, lengths, report = np.eye(4)[np.newaxis], np.empty((1, drive.size)), np.empty((1, REPORT))
-    iterations, step = 0, 1.0
-    while step >= SMALLEST_SUBSTEP:
-        begun = time.perf_counter()
+    tip, lengths, report = np.eye(4)[np.newaxis], np.empty((1, drive.size)), np.full((1, REPORT), FAILED, dtype=np.float64)
+    iterations = 0
+    while step >= SMALLEST_SUBSTEP and time.perf_counter() < deadline:
         solve_lanes(
             model, strain, tension, from_drive, from_load, drive[np.newaxis], load[np.newaxis], tip, lengths, report, step
         )
         iterations += int(report[0, 2])
         step = float(report[0, 3])
-        now = time.perf_counter()
-        if report[0, 0] != FAILED or not model.ladder or now + (now - begun) > deadline:
+        if report[0, 0] != FAILED or not model.ladder:
             break
     here = Lane(strain[0], tension[0], from_drive[0], from_load[0])
     return _Followed(bool(report[0, 0] != FAILED), here, tip[0], lengths[0], float(report[0, 1]), iterations)
