@@ -121,12 +121,12 @@ def test_a_broken_solver_is_found_out(monkeypatch, no_goals):
 
 
 def test_falls_are_counted_and_looked_at(monkeypatch):
-    """One TCA alone: near 145 degC the arm buckles, in each lane once."""
+    """One TCA alone: near 145 degC the arm buckles, in each lane once; it would come back the same way."""
     monkeypatch.setitem(torture.POLICIES, "one", lambda rng, lanes, *_: lambda core, age: np.tile([1.0, -1, -1], (lanes, 1)))
     run = torture.drive("reach", "one", 30 * torture.LANES)
-    assert run.jumps == run.rungs[torture.RUNGS.index(Rung.DESCENT)] == torture.LANES
+    assert run.rungs[torture.RUNGS.index(Rung.DESCENT)] == torture.LANES
+    assert run.jumps == 0
     assert run.stability.size in (torture.LANES + 1, torture.LANES + 2) and 0.0 < run.stability.min() < 0.5
-    assert f"{torture.LANES} times the arm left its branch" in torture.report([run])
 
 
 def test_stability_is_that_of_the_equilibrium():
