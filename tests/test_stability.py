@@ -18,7 +18,8 @@ from scipy.linalg import eigh
 from scipy.optimize import brentq
 
 from tca_envs.mechanics import TCA, Arm, Equilibrium, Grid, Module, Muscle, Payload, Rung, Spring, Tendon, shooting
-from tca_envs.presets import BELOW_BENDING, GRAVITY, bending_module
+from tca_envs.mechanics.thermal import AMBIENT
+from tca_envs.presets import BELOW_BENDING, GRAVITY, bending_arm, bending_module
 from tca_envs.tasks.core import CUT_OFF
 
 Array = NDArray[np.float64]
@@ -824,3 +825,21 @@ def test_a_solve_keeps_its_time_limit():
         assert perf_counter() - begin < limit + 0.5
         assert not result.converged
         assert "time limit" in result.message
+
+
+@pytest.mark.parametrize(("hot", "critical"), [((0,), 141.0), ((0, 1), 156.0)])
+def test_the_hanging_arm_buckles_sideways_where_its_symmetric_shape_turns_unstable(hot, critical):
+    """A pitchfork: it leaves to one side, goes on from there without a jump and comes back the same way."""
+    arm = bending_arm()
+    across = np.array([[0.0, 1.0], [np.sqrt(0.75), -0.5]][len(hot) - 1])  # to the plane of symmetry
+    sides = []
+    state = None
+    ways = [*np.linspace(critical - 6.0, critical + 2.0, 17), *np.linspace(critical + 2.0, critical - 6.0, 17)[1:]]
+    for temperature in ways:
+        drive = np.full(3, AMBIENT)
+        drive[list(hot)] = temperature
+        state = arm.equilibrium(drive, start=state)
+        assert state.converged and state.stable and not state.jumped
+        sides.append(abs(across @ state.tip_pose[:2, 3]))
+        assert (sides[-1] > 1e-5) == (temperature > critical + 0.4) or abs(temperature - critical) < 0.6
+    assert max(sides) > 5e-4 and sides[-1] < 1e-6

@@ -37,6 +37,7 @@ Array = NDArray[np.float64]
 ArrayOf3 = tuple[float, float, float]
 ZERO: ArrayOf3 = (0.0, 0.0, 0.0)
 EYE = np.eye(4)[np.newaxis]
+LADDER = tuple(Rung)
 RUNGS = {
     SUBSTEPS: "substeps in drive and load",
     FINER: "substeps on a finer grid",
@@ -389,9 +390,9 @@ class Arm:
         """Return whether `closed_form` applies: nothing loads the arm, and its modules' strains are uniform then."""
         return self._weightless and not load[:6].any() and not (load[PAYLOAD_MASS] and self.gravity.any())
 
-    def unloaded(self) -> tuple[Array, Array, Array, Array]:
+    def unloaded(self) -> Lane:
         """Return strain (G, 6), tension (n,), drive (n,) and load of the unloaded arm: where every cold start begins."""
-        return self._unloaded_strain.copy(), np.zeros(len(self.muscles)), self._neutral.copy(), np.zeros(LOAD)
+        return Lane(self._unloaded_strain.copy(), np.zeros(len(self.muscles)), self._neutral.copy(), np.zeros(LOAD))
 
     def equilibrium(
         self,
@@ -438,17 +439,20 @@ class Arm:
         load = self.load(tip_force, tip_moment, payload)
         if time_limit_s is not TIME_LIMIT_S:
             time_limit_s = check.scalar("time_limit_s", time_limit_s, 0.0, above=True)
-        lane = Lane(*(self.unloaded() if start is None else self.restart(start)))
+        lane = self.unloaded() if start is None else self.restart(start)
         tip, lengths, report = EYE.copy(), np.empty((1, drive.size)), np.empty((1, REPORT))
         asked = (drive[np.newaxis], load[np.newaxis])
         on, message = self, ""
         if not (self.unstressed(load) and self._closed_form(lane, *asked, tip, lengths, report)):
             compile_kernels()
             begun = time.perf_counter()
-            known = Lane(*(values[np.newaxis] for values in lane))
-            solve_lanes(self.model, *known, *asked, tip, lengths, report)
+            strain, tension, from_drive, from_load = lane
+            solve_lanes(
+                self.model, strain[np.newaxis], tension[np.newaxis], from_drive[np.newaxis], from_load[np.newaxis], *asked,
+                tip, lengths, report,
+            )  # fmt: skip
             if report[0, 0] == FAILED:
-                here = Lane(*(self.unloaded() if start is None else self.restart(start)))
+                here = self.unloaded() if start is None else self.restart(start)
                 climbed = ladder.climb(self, here, lane, drive, load, report[0, 3], begun, time_limit_s)
                 message, on, lane = climbed.message, climbed.arm, climbed.lane
                 tip[0], lengths[0], iterations = climbed.tip, climbed.lengths, report[0, 2] + climbed.iterations
@@ -472,7 +476,7 @@ class Arm:
             muscle_lengths=lengths[0],
             drive=drive,
             converged=rung != FAILED,
-            rung=Rung(int(rung)),
+            rung=LADDER[int(rung)],
             jumped=bool(jumped),
             residual=residual,
             iterations=int(iterations),
@@ -513,7 +517,7 @@ class Arm:
                 )
         return result
 
-    def restart(self, start: Equilibrium) -> tuple[Array, Array, Array, Array]:
+    def restart(self, start: Equilibrium) -> Lane:
         """Return strain (G, 6) on this arm's grid, tension (n,), drive (n,) and load of an equilibrium, as copies.
 
         Raises
@@ -539,7 +543,7 @@ class Arm:
                 strain = carried([Grid(e, q) for e, q in zip(model.elements, model.nodes, strict=True)], nodes, self.grids)
             else:
                 strain = start.strain(self.node_arc)
-        return strain, start.tensions.copy(), from_drive.copy(), from_load.copy()
+        return Lane(strain, start.tensions.copy(), from_drive.copy(), from_load.copy())
 
 
 class _Shape(NamedTuple):

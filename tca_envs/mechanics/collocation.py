@@ -66,11 +66,6 @@ MAX_SHEAR_STEP = 0.5
 CONTRACTION = 0.5
 ROUND_OFF = 1e-8
 """A step that is shorter need not contract."""
-NEAR = 0.01
-"""Factors are taken anew after a step that turns a section by more [rad]."""
-SAFE = 0.1
-"""Factors of the last step certify stability where their pivots over the rod's stiffness are above this; an unloaded rod's are
-0.29. Within NEAR they change by much less."""
 NEUTRAL = 1e-5
 """Smallest eigenvalues of the tangent (see `ladder.smallest_eigenvalue`) above minus this are neutral, not unstable: an arm
 that can turn about an axis of symmetry without any work has a zero among them, up to the grid's error. Newton adds so many
@@ -413,13 +408,12 @@ def eliminate(model, strain, tension, load, damping, ws):
 
     Returns
     -------
-    tuple
-        How many eigenvalues of the tangent, as a quadratic form in the strain, are negative: those of the pivots, by
-        Sylvester's law of inertia, and by Haynsworth's, as each muscle's row brings in a negative one where it has not made up
-        for one of the rod's. And a lower bound of the smallest eigenvalue of the nodes' pivots over the rod's stiffness:
-        zero at the latest where the equilibrium turns unstable.
+    int
+        How many eigenvalues of the tangent, as a quadratic form in the strain, are negative: as many as of its pivots, by
+        Sylvester's law of inertia, less one for each muscle's pivot that is not negative: that muscle has made up for one of
+        the rod's (Haynsworth).
     """
-    index, worst = 0, 0.0  # worst: largest trace of an inverse pivot times stiffness
+    index = 0
     a, b, elements, nodes, first_muscle = model.a, model.b, model.elements, model.nodes, model.first_muscle
     matrix, phi, pulled, base, stretch = ws.matrix, ws.phi, ws.pulled, ws.base, ws.stretch
     pull, swing, x_block, y_block, n_block, beta = (
@@ -509,10 +503,7 @@ def eliminate(model, strain, tension, load, damping, ws):
                     for j in range(q):
                         t, t2 = get3(ws.wrench, g0 + j, 6 * c + 3), get3(ws.wrench, g0 + j, 6 * c2 + 3)
                         beta[c, c2] -= h * b[k, j] * dot(t, apply(get9(ws.compliance, g0 + j), t2))
-            negative, most = _factorise_blocks(matrix, phi, pulled, inside, g0, q, wide, mk)
-            index += negative
-            stiff = max(model.stiffness[k, 0], model.stiffness[k, 1], model.stiffness[k, 2])
-            worst = max(worst, stiff * most)
+            index += _factorise_blocks(matrix, phi, pulled, inside, g0, q, wide, mk)
             for l in range(g0, g0 + q):
                 p_new = axpy9(1.0, matmul(get9(base, l), get9(phi, l)), p_new)
                 for c in range(mk):
@@ -544,7 +535,7 @@ def eliminate(model, strain, tension, load, damping, ws):
                 follow[c, d] = ws.gamma[c]
         for c in range(mk):
             p_end = axpy9(-1.0, outer(get3(handed, big_q + c, 0), get3(follow, c, 0)), p_end)
-    return index, (1.0 / worst if index == 0 and worst < np.inf else 0.0)
+    return index
 
 
 @inner
@@ -552,15 +543,13 @@ def _factorise_blocks(matrix, phi, pulled, inside, g0, q, wide, mk):
     """LU without pivoting, in 3 x 3 blocks, of an element's matrix; `phi` (if `inside`) and `pulled` become the solutions.
 
     At a stable equilibrium the matrix is positive definite up to a diagonal scaling, so pivoting buys nothing; where it is
-    singular the answer is not finite. Diagonal blocks are stored inverted. Returns how many of their eigenvalues are negative,
-    and the largest trace of an inverse (inf if any is).
+    singular the answer is not finite. Diagonal blocks are stored inverted. Returns how many of their eigenvalues are negative.
     """
-    negative, most = 0, 0.0
+    negative = 0
     for k in range(q):
         row_k = (g0 + k) * wide
         pivot = inverse(get9(matrix, row_k + k))
         negative += negatives(pivot)
-        most = max(most, pivot[0] + pivot[4] + pivot[8])
         put9(matrix, row_k + k, pivot)
         phi_k = get9(phi, g0 + k)
         for i in range(k + 1, q):
@@ -587,7 +576,7 @@ def _factorise_blocks(matrix, phi, pulled, inside, g0, q, wide, mk):
             for l in range(k + 1, q):
                 x = axpy(-1.0, apply(get9(matrix, row_k + l), get3(pulled, g0 + l, 3 * c)), x)
             put3(pulled, g0 + k, 3 * c, apply(get9(matrix, row_k + k), x))
-    return negative, (most if negative == 0 else np.inf)
+    return negative
 
 
 @inner
@@ -722,8 +711,8 @@ def newton(model, strain, tension, drive, load, moved, ws):
     section 5.1). What has `moved`, drive or load, takes a step even where the
     start would do: a small change moves the arm a little, not in jerks.
 
-    The answer must be stable by the count of `eliminate`. Factors of an earlier step serve for this as they do for the steps,
-    unless they are near to singular.
+    The answer must be stable by the count of `eliminate` there. Factors of an earlier step would not do, however well they
+    serve for steps: the smallest eigenvalue changes by as much as the arm turns.
 
     Returns
     -------
@@ -731,20 +720,16 @@ def newton(model, strain, tension, drive, load, moved, ws):
         converged (bool), dimensionless residual, iterations.
     """
     worst = size = np.inf
-    margin = since = 0.0
     iterations = 0
     while True:
         before = worst
         worst, _ = evaluate(model, strain, tension, drive, load, iterations > 0, ws)
         there = worst < model.tolerance and (iterations > 0 or not moved)
-        if there and margin > SAFE and since <= NEAR:
-            return True, worst, iterations
         if not worst < np.inf or (iterations == MAX_ITERATIONS and not there):
             return False, worst, iterations
         # Near the answer a step with old factors gains almost as much as one with new ones, at a third of the cost.
-        if there or since > NEAR or not worst < REUSE * before or before == np.inf:
-            index, margin = eliminate(model, strain, tension, load, NEUTRAL, ws)
-            since = 0.0
+        if there or not worst < REUSE * before or before == np.inf:
+            index = eliminate(model, strain, tension, load, NEUTRAL, ws)
             if there:
                 return index == 0, worst, iterations
         rotation, shear = substitute(model, ws)
@@ -752,7 +737,6 @@ def newton(model, strain, tension, drive, load, moved, ws):
         if not (rotation < MAX_ROTATION_STEP and shear < MAX_SHEAR_STEP and (size < CONTRACTION * last or size < ROUND_OFF)):
             return False, worst, iterations
         iterations += 1
-        since += size
         for g in range(strain.shape[0]):
             put3(strain, g, 0, axpy(1.0, get3(ws.bend, g, 0), get3(strain, g, 0)))
             put3(strain, g, 3, axpy(1.0, get3(ws.shear, g, 0), get3(strain, g, 3)))
@@ -933,15 +917,15 @@ def linearise(model, strain, tension, drive, load, damping, slaved, ask, given):
     Returns
     -------
     tuple
-        Residual, sum of its squares, energy [J] (true where tensions are slaved), `eliminate`'s count and bound, the step's
+        Residual, sum of its squares, energy [J] (true where tensions are slaved), `eliminate`'s count, the step's
         largest rotation [rad] and largest dv, its work against the imbalance g . dx and its size dx . K dx [J], as an array
-        (9,); quaternions at element ends and nodes, positions at ends, p' and p' x n at the nodes, path lengths; bend and
+        (8,); quaternions at element ends and nodes, positions at ends, p' and p' x n at the nodes, path lengths; bend and
         shear of the step (G, 3); d(tip position, tip rotation) of the step or, for JACOBIAN, by each drive (6, 1 or n): by
         the implicit function theorem, not finite where it has none.
     """
     ws = workspace(model)
     n = tension.size
-    numbers = np.zeros(9)
+    numbers = np.zeros(8)
     columns = n if ask == JACOBIAN else (1 if ask >= STEP else 0)
     tips = np.zeros((6, columns))
     worst = total = np.inf
@@ -959,8 +943,7 @@ def linearise(model, strain, tension, drive, load, damping, slaved, ask, given):
     if worst < np.inf:
         numbers[2] = _energy(model, strain, tension, load, ws)
         if ask != SHAPE:
-            index, numbers[4] = eliminate(model, strain, tension, load, damping, ws)
-            numbers[3] = index
+            numbers[3] = eliminate(model, strain, tension, load, damping, ws)
         if ask >= GIVEN:
             ws.gap[:] = 0.0
             for g in range(strain.shape[0]):
@@ -973,7 +956,7 @@ def linearise(model, strain, tension, drive, load, damping, slaved, ask, given):
                 else:
                     _, _, slope = elongation(model.kind[i], model.parameters, i, model.rest_length[i], tension[i], drive[i])
                     ws.gap[i] = -slope
-            numbers[5], numbers[6] = substitute(model, ws)
+            numbers[4], numbers[5] = substitute(model, ws)
             tips[:, i] = ws.tip
             if ask == JACOBIAN:
                 ws.gap[i] = 0.0
@@ -984,7 +967,7 @@ def linearise(model, strain, tension, drive, load, damping, slaved, ask, given):
                 weight = h * model.b[k, node % model.nodes[k]]
                 for i in range(3 if columns else 0):
                     bend, shear = ws.bend[g, i], ws.shear[g, i]
-                    numbers[7] += weight * (ws.residual[g, i] * bend + ws.residual[g, 3 + i] * shear)
-                    numbers[8] += weight * (model.stiffness[k, i] * bend**2 + model.stiffness[k, 3 + i] * shear**2)
+                    numbers[6] += weight * (ws.residual[g, i] * bend + ws.residual[g, 3 + i] * shear)
+                    numbers[7] += weight * (model.stiffness[k, i] * bend**2 + model.stiffness[k, 3 + i] * shear**2)
                 g += 1
     return numbers, ws.ends, ws.quaternion, ws.position, ws.tangent, ws.spin, ws.length, ws.bend, ws.shear, tips

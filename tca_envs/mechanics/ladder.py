@@ -282,7 +282,7 @@ def descend(model: Model, lane: Lane, drive: Array, load: Array, late: Callable[
     strain, tension, damping = lane.strain.copy(), lane.tension.copy(), FIRST_DAMPING
     numbers, way, turn = look(strain, tension, damping)
     for step in range(MAX_DESCENT):
-        residual, _, energy, index, _, rotation, slide, slope, size = numbers.tolist()
+        residual, _, energy, index, rotation, slide, slope, size = numbers.tolist()
         if not residual < np.inf or damping > MOST_DAMPING or late():
             return None, step
         if residual < end:
@@ -323,7 +323,7 @@ def _pushed_off(model: Model, strain: Array, tension: Array, drive: Array, load:
             model, strain, tension.copy(), drive, load, damping, False, GIVEN, -stiffness * mode
         )
         mode = np.hstack([bend, shear])
-        mode *= NUDGE / numbers[5]
+        mode *= NUDGE / numbers[4]
     return strain + mode
 
 
