@@ -708,8 +708,8 @@ def newton(model, strain, tension, drive, load, moved, ws):
     is not CONTRACTION times shorter than the one before; or if it takes long. For a solve that has to be steered may end on
     another branch, and one that contracts stays on its own: with steps half as long each time no singular tangent lies on the
     way (the theorem of Newton and Kantorovich in affine covariant form; Deuflhard, Newton Methods for Nonlinear Problems, 2004,
-    section 5.1). What has `moved`, drive or load, takes a step even where the
-    start would do: a small change moves the arm a little, not in jerks.
+    section 5.1). What has `moved`, drive or load, takes a step even where the start would do: a small change moves the arm a
+    little, not in jerks.
 
     The answer must be stable by the count of `eliminate` there. Factors of an earlier step would not do, however well they
     serve for steps: the smallest eigenvalue changes by as much as the arm turns.

@@ -52,6 +52,7 @@ FIRST_DAMPING = 0.1
 EASING = 0.2
 """The damping falls by this factor after a step that went as predicted."""
 MOST_DAMPING = 1e8
+"""No tangent of a configuration needs more."""
 COLLAPSED = 0.01
 """A muscle's path that is shorter, per length of the rod, is about to become a point; there is no tangent then."""
 NUDGE = 0.02
@@ -297,7 +298,7 @@ def descend(model: Model, lane: Lane, drive: Array, load: Array, late: Callable[
             trial, pull = strain + share * way, tension.copy()
             there = look(trial, pull, EASING * damping)
             predicted = -share * slope + 0.5 * share**2 * (slope + damping * size)
-            gained = energy - there[0][2] + share * float(load[3:6] @ turn)
+            gained = energy - there[0][2] + share * float(load[3:6] @ turn) if there[0][0] < np.inf else -np.inf
             level = abs(gained) < flat and predicted < flat
             if gained > 0.5 * predicted or level:
                 strain, tension, damping = trial, pull, EASING * damping
@@ -313,7 +314,7 @@ def descend(model: Model, lane: Lane, drive: Array, load: Array, late: Callable[
 def _pushed_off(model: Model, strain: Array, tension: Array, drive: Array, load: Array) -> Array:
     """Return strains (G, 6) a little off an unstable equilibrium, along its softest mode, which inverse iteration finds."""
     damping = 0.01
-    while negative_eigenvalues(model, strain, tension, drive, load, damping):
+    while damping < MOST_DAMPING and negative_eigenvalues(model, strain, tension, drive, load, damping):
         damping *= 2.0
     stiffness = np.repeat(model.stiffness, model.elements * model.nodes, axis=0)
     # A direction that no symmetric arm's softest mode is orthogonal to; so the side to which such an arm falls is settled.
