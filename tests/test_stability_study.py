@@ -107,7 +107,8 @@ def test_the_verdict_follows_from_the_cells():
     assert f"tension-force at 2, 0: {WORDS[Outcome.OTHER]} (DESCENT); found by {WRENCH}" in text
     in_doubt = [*good, row(OURS, Outcome.OTHER, 2.0, doubt="two ends"), row(WRENCH, Outcome.RIGHT, 2.0, doubt="two ends")]
     assert stability.verdict(in_doubt) == stability.verdict(good)
-    assert "All 1 answers" in stability.soundness([r for r in good if r.method == OURS])
+    sound = stability.soundness([*(r for r in good if r.method == OURS), row(OURS, Outcome.NOTHING, 2.0, seconds=nan)])
+    assert "All 1 answers" in sound and "on 1 cells it says" in sound and "1 steps have nothing" in sound
     assert "1 of 1 answers" in stability.soundness([row(OURS, Outcome.UNSTABLE)])
 
 
@@ -115,6 +116,7 @@ def test_the_study_writes_maps_chart_table_and_page(tmp_path, monkeypatch):
     family = stability_cells.tension_force(2)
     monkeypatch.setattr(stability, "FAMILIES", {family.name: lambda count: family})
     monkeypatch.setattr(stability, "COMPARED", (stability.COMPARED[0], (wrench_shooting.METHOD, 16)))
+    monkeypatch.setattr(stability.torture, "run", lambda out, quick: f"## Policies\n\n{quick}\n")
     said = []
     stability.run(tmp_path, quick=True, say=said.append)
     with (tmp_path / "stability.csv").open(newline="", encoding="utf-8") as file:
@@ -127,7 +129,7 @@ def test_the_study_writes_maps_chart_table_and_page(tmp_path, monkeypatch):
     assert (tmp_path / "stability_map.png").stat().st_size > 10_000 < (tmp_path / "failure_rate.png").stat().st_size
     page = (tmp_path / "stability.md").read_text(encoding="utf-8")
     assert "4 cells, 4 with a right answer" in page and "On every one of" in page and f"| {OURS} " in page
-    assert said[0] in page
+    assert said[0] in page and page.endswith("\n\n## Policies\n\nTrue\n")
 
 
 def test_a_step_starts_from_the_methods_own_answer():

@@ -2,7 +2,7 @@
 
 Families of cells (`stability_cells`) go from easy to hopeless: cold starts under large tensions and tip forces, long rods, the
 paper's thin arm with gravity from down to up, large steps of temperature. Every method solves every cell, once made ready and
-all in one run; failures are timed, too.
+all in one run; failures are timed, too. What the tasks meet under random policies is in `torture`.
 """
 
 import re
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tca_envs.mechanics import Arm, Equilibrium, Rung
-from tca_envs.study import output
+from tca_envs.study import output, torture
 from tca_envs.study.chart import styles
 from tca_envs.study.method import Answer, Method, State
 from tca_envs.study.methods import bvp, paper, wrench_shooting
@@ -197,7 +197,10 @@ def soundness(mine: Sequence[Result]) -> str:
     bad = [f"{place(r)}: {WORDS[r.outcome]}" for r in answers if r.outcome in (Outcome.UNSTABLE, Outcome.WRONG)]
     if bad:
         return f"{len(bad)} of {len(answers)} answers of this package are no stable equilibria:\n\n{bullets(bad)}"
-    return f"All {len(answers)} answers of this package are stable equilibria; on the other cells it says that it has none."
+    asked = sum(isfinite(r.seconds) for r in mine)
+    silent = f"on {asked - len(answers)} cells it says that it has none, and why"
+    unasked = f"; {len(mine) - asked} steps have nothing to start from" if asked < len(mine) else ""
+    return f"All {len(answers)} answers of this package are stable equilibria; {silent}{unasked}."
 
 
 def place(r: Result) -> str:
@@ -398,7 +401,7 @@ def write(results: Sequence[Result], path: Path) -> None:
 
 
 def run(out: Path, quick: bool = False, say: Callable[[str], object] = print) -> None:
-    """Measure, and write stability (.csv, .md), stability_map.png and failure_rate.png into the folder `out`.
+    """Measure, and write stability (.csv, .md), stability_map.png, failure_rate.png and torture.csv into the folder `out`.
 
     Parameters
     ----------
@@ -421,6 +424,7 @@ def run(out: Path, quick: bool = False, say: Callable[[str], object] = print) ->
     write(results, out / "stability.csv")
     draw_maps(results, families, out / "stability_map.png")
     draw_rates(results, out / "failure_rate.png")
-    (out / "stability.md").write_text(report(results, families), encoding="utf-8")
+    page = report(results, families) + "\n" + torture.run(out, quick)
+    (out / "stability.md").write_text(page, encoding="utf-8")
     say(findings(results))
-    say(f"wrote stability (.csv, .md), stability_map.png and failure_rate.png in {out}")
+    say(f"wrote stability (.csv, .md), stability_map.png, failure_rate.png and torture.csv in {out}")
