@@ -77,8 +77,17 @@ def test_answers_are_told_apart():
     for method, setting in ((wrench_shooting.METHOD, 16), (bvp.METHOD, 1e-3), (paper.METHODS[0], 1e-3)):
         solver = method.build(arm, setting, [state])
         assert outcome(state, solver.solve(state, solver.cold()), right, arm) is Outcome.UNSTABLE
-    elsewhere = State(arm, np.array([25.0, 25.0, 80.0]))
-    assert outcome(elsewhere, fallen, None, arm) is Outcome.WRONG
+    hot = State(arm, np.array([25.0, 25.0, 80.0]))
+    assert outcome(hot, fallen, None, arm) is Outcome.WRONG  # nothing is found from there
+    arm = stability_cells.tilted(1.0)
+    hanging = stability.ours(arm, "", []).solve(State(arm, np.full(3, 25.0)), None)
+    for temperature, what in ((30.0, Outcome.OTHER), (110.0, Outcome.WRONG)):
+        warmer = State(arm, np.array([temperature, 25.0, 25.0]))
+        assert outcome(warmer, hanging, None, arm) is what
+    inaccurate = State(arm, np.array([55.0, 25.0, 25.0]))
+    right = stability.ours(arm, "", []).solve(inaccurate, None).guess
+    off = np.linalg.norm(right.tip_pose[:3, 3] - hanging.tip[:3, 3]) / arm.length
+    assert 0.01 < off < 0.02 and outcome(inaccurate, hanging, right, arm) is Outcome.RIGHT
 
 
 def test_rates_and_times_leave_out_what_says_nothing():
