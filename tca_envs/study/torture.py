@@ -281,14 +281,15 @@ def drive(name: str, policy: str, steps: int, progress: Callable[[Iterable[int]]
                 rare[rng.integers(LANES)] = True
             stability += [stability_of(core, lane) for lane in np.flatnonzero(rare).tolist()]
     assert core.slowest is not None
+    looked_at = np.array(stability)
     return Run(
         name, policy, np.concatenate(core.reports), 1e-9 * np.array(core.cpu), 1e-9 * np.array(core.wall),
-        np.concatenate(change), np.concatenate(finite), np.array(stability), core.slowest, core.failed,
+        np.concatenate(change), np.concatenate(finite), looked_at[np.isfinite(looked_at)], core.slowest, core.failed,
     )  # fmt: skip
 
 
 def stability_of(core: Core, lane: int) -> float:
-    """Return `Equilibrium.stability` of the state in which a lane is, on the grid on which it was found."""
+    """Return `Equilibrium.stability` of the state in which a lane is, on the grid on which it was found; nan if not found again."""
     arm, record = core.arm, core.record
     state = Lane(record.strain[lane], record.tension[lane], record.drive[lane], record.load[lane])
     here = linearise(arm.model, state.strain, state.tension.copy(), *state[2:], 0.0, False, SHAPE, state.strain)
@@ -297,8 +298,9 @@ def stability_of(core: Core, lane: int) -> float:
         strain, tension, drive, load = (values[np.newaxis].copy() for values in arm.on(arm.finer, state))
         tip, lengths, report = np.eye(4)[np.newaxis], np.empty_like(tension), np.empty((1, REPORT))
         solve_lanes(arm.finer.model, strain, tension, drive, load, drive.copy(), load.copy(), tip, lengths, report)
-        if solved(report).all():
-            return ladder.smallest_eigenvalue(arm.finer.model, strain[0], tension[0], drive[0], load[0])
+        if not solved(report).all():
+            return np.nan
+        return ladder.smallest_eigenvalue(arm.finer.model, strain[0], tension[0], drive[0], load[0])
     return ladder.smallest_eigenvalue(arm.model, *state)
 
 
