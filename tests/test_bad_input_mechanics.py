@@ -92,7 +92,7 @@ CASES: dict[tuple[Callable[..., Any], str], list[Any]] = {
         "x",
     ],
     (module, "mass_per_length"): [*NO_NUMBER, -1e-9],
-    (module, "muscles"): [0.0, None, tendon(), Tendon()],
+    (module, "muscles"): [0.0, None, tendon(), Tendon(), [tendon()] * 33],
     (module, "reference_strain"): [
         (0.0, 0.0, 0.0),
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),

@@ -253,7 +253,7 @@ def test_a_failed_solve_keeps_the_last_good_state_and_truncates(env, monkeypatch
     observation = unwrapped._observe()
 
     def without_answer(arm, strain, tension, *rest):
-        rest[-1][:] = (collocation.FAILED, 1.0, 7, 0)
+        rest[-1][:] = (collocation.FAILED, 1.0, 7, 0, 0)
 
     monkeypatch.setattr(core.ladder, "solve", without_answer)
     after, reward, terminated, truncated, info = unwrapped.step(np.ones(env.action_space.shape, np.float32))

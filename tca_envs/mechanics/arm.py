@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tca_envs.mechanics import check, closed_form, ladder, section
+from tca_envs.mechanics import check, closed_form, collocation, ladder, section
 from tca_envs.mechanics.collocation import (
     CLOSED_FORM,
     DESCENT,
@@ -92,6 +92,8 @@ class Module:
         for i, muscle in enumerate(muscles):
             if not isinstance(muscle, Muscle):
                 raise ValueError(f"muscles[{i}] = {muscle!r}: expected a Muscle")
+        if len(muscles) > MOST_MUSCLES:
+            raise ValueError(f"muscles = {self.muscles!r}: expected at most {MOST_MUSCLES} in a module")
         for values in (stiffness, reference):
             values.setflags(write=False)
         object.__setattr__(self, "stiffness", stiffness)
@@ -192,7 +194,9 @@ MAX_NODES = 16
 FINE_ENOUGH = 1000
 """Nodes of an arm beyond which `Arm.finer` is no finer."""
 MOST_NODES = 10_000
-"""Of an arm; an iteration of Newton takes some tens of milliseconds then."""
+"""Of an arm: a few iterations of Newton still fit into a second."""
+MOST_MUSCLES = 32
+"""Of a module, for the same reason."""
 
 
 @dataclass(frozen=True)
@@ -281,7 +285,7 @@ def carried(here: Sequence[Grid], strain: Array, there: Sequence[Grid]) -> Array
         last = first + old.elements * old.nodes
         parts.append(interpolated(old, strain[..., first:last, :], new))
         first = last
-    return np.concatenate(parts, axis=-2)
+    return np.ascontiguousarray(np.concatenate(parts, axis=-2))  # kernels are compiled for this layout alone
 
 
 def default_grid(module: Module) -> Grid:
@@ -456,8 +460,11 @@ class Arm:
                 climbed = ladder.climb(self, here, lane, drive, load, report[0, 3], begun, time_limit_s)
                 message, on, lane = climbed.message, climbed.arm, climbed.lane
                 tip[0], lengths[0], iterations = climbed.tip, climbed.lengths, report[0, 2] + climbed.iterations
-                report[0] = climbed.rung, climbed.residual, iterations, climbed.jumped
-        rung, residual, iterations, jumped = report[0].tolist()
+                report[0, :4] = climbed.rung, climbed.residual, iterations, climbed.jumped
+            elif report[0, 0] == SUBSTEPS or report[0, 4] > ladder.LONG:
+                here = self.unloaded() if start is None else self.restart(start)
+                report[0, 3] = not ladder.returns(self.model, lane, here, begun + time_limit_s)
+        rung, residual, iterations, jumped, _ = report[0].tolist()
         if rung == FAILED:
             on, lane = self, here
             ends, _, position, _, _, lengths[0] = on.shape(lane)
@@ -495,8 +502,9 @@ class Arm:
         found = tuple(values[np.newaxis].copy() for values in lane)
         if not closed_form.solve_lane(self.model, self.sections, *found, drive, load, tip, lengths, report):
             return False
-        # The energy is convex where nothing pushes.
-        if (found[1] < 0.0).any() and ladder.negative_eigenvalues(self.model, *(values[0] for values in found)):
+        # Where nothing pushes the energy is convex; but a muscle may, and a coarse grid may not hold the shape.
+        strain, tension, at_drive, at_load = (values[0] for values in found)
+        if ladder.negative_eigenvalues(self.model, strain, tension, at_drive, at_load, collocation.NEUTRAL):
             return False
         for values, new in zip(lane, found, strict=True):
             values[...] = new[0]

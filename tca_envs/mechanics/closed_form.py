@@ -199,5 +199,6 @@ def solve_lane(model, sections, strain, tension, from_drive, from_load, drive, l
     strain[0], tension[0], lengths[0], from_drive[0], from_load[0] = found, pull, path, drive[0], load[0]
     tip[0, :3, :3] = rotation
     tip[0, :3, 3] = position
-    report[0, 0], report[0, 1], report[0, 2], report[0, 3] = CLOSED_FORM, worst, iterations, 0.0
+    report[0, 0], report[0, 1], report[0, 2] = CLOSED_FORM, worst, iterations
+    report[0, 3] = report[0, 4] = 0.0
     return True

@@ -73,14 +73,14 @@ times the rod's stiffness to the tangent, or it would be singular there."""
 FIRST_SUBSTEP = 0.25
 SMALLEST_SUBSTEP = 1.0 / 1024.0
 WORK = 10_000
-"""Nodes times Newton iterations of one call: some milliseconds."""
+"""Nodes times Newton iterations of one call; muscles beyond a few to a module count, too."""
 SWEEPS = 60
 REUSE = 0.3  # Newton keeps its factors as long as a step shrinks the residual to less than this
 ORIGIN = (0.0, 0.0, 0.0)
 
 WARM, SUBSTEPS, FINER, DESCENT, FAILED, CLOSED_FORM = 0, 1, 2, 3, 4, 5
 """Rungs of the ladder, see `equilibrium.Rung`."""
-REPORT = 4
+REPORT = 5
 """Numbers in the report of a lane, see `solve_lanes`."""
 SHAPE, INERTIA, STEP, GIVEN, JACOBIAN = 0, 1, 2, 3, 4
 """What `linearise` is asked for."""
@@ -706,10 +706,10 @@ def newton(model, strain, tension, drive, load, moved, ws):
 
     Newton must go straight to the answer. It gives up where a step turns a section by more than MAX_ROTATION_STEP; where a step
     is not CONTRACTION times shorter than the one before; or if it takes long. For a solve that has to be steered may end on
-    another branch, and one that contracts stays on its own: with steps half as long each time no singular tangent lies on the
-    way (the theorem of Newton and Kantorovich in affine covariant form; Deuflhard, Newton Methods for Nonlinear Problems, 2004,
-    section 5.1). What has `moved`, drive or load, takes a step even where the start would do: a small change moves the arm a
-    little, not in jerks.
+    another branch. One that contracts finds the only equilibrium nearby (the theorem of Newton and Kantorovich in affine
+    covariant form; Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 5.1); that this is on the branch that the
+    start is on is seen by going back, `ladder.returns`, where the way is long. What has `moved`, drive or load, takes a step
+    even where the start would do: a small change moves the arm a little, not in jerks.
 
     The answer must be stable by the count of `eliminate` there. Factors of an earlier step would not do, however well they
     serve for steps: the smallest eigenvalue changes by as much as the arm turns.
@@ -717,25 +717,26 @@ def newton(model, strain, tension, drive, load, moved, ws):
     Returns
     -------
     tuple
-        converged (bool), dimensionless residual, iterations.
+        converged (bool), dimensionless residual, iterations, size of the first step.
     """
     worst = size = np.inf
-    iterations = 0
+    iterations, first = 0, 0.0
     while True:
         before = worst
         worst, _ = evaluate(model, strain, tension, drive, load, iterations > 0, ws)
         there = worst < model.tolerance and (iterations > 0 or not moved)
         if not worst < np.inf or (iterations == MAX_ITERATIONS and not there):
-            return False, worst, iterations
+            return False, worst, iterations, first
         # Near the answer a step with old factors gains almost as much as one with new ones, at a third of the cost.
         if there or not worst < REUSE * before or before == np.inf:
             index = eliminate(model, strain, tension, load, NEUTRAL, ws)
             if there:
-                return index == 0, worst, iterations
+                return index == 0, worst, iterations, first
         rotation, shear = substitute(model, ws)
         last, size = size, rotation + shear
+        first = size if iterations == 0 else first
         if not (rotation < MAX_ROTATION_STEP and shear < MAX_SHEAR_STEP and (size < CONTRACTION * last or size < ROUND_OFF)):
-            return False, worst, iterations
+            return False, worst, iterations, first
         iterations += 1
         for g in range(strain.shape[0]):
             put3(strain, g, 0, axpy(1.0, get3(ws.bend, g, 0), get3(strain, g, 0)))
@@ -758,11 +759,12 @@ def solve(model, strain, tension, from_drive, from_load, drive, load, first, bud
     -------
     tuple
         rung (WARM, SUBSTEPS or FAILED), dimensionless residual, Newton iterations in all, next substep as a share of what is
-        left of the way.
+        left of the way, largest first step of Newton.
     """
     first_drive, first_load = from_drive.copy(), from_load.copy()
     good_strain, good_tension = strain.copy(), tension.copy()
     drive_now, load_now = drive.copy(), load.copy()
+    longest, work = 0.0, 0
     done, step, spent, rung, moved = 0.0, first, 0, WARM if first == 1.0 else SUBSTEPS, False
     for i in range(drive.size):
         moved |= drive[i] != from_drive[i]
@@ -774,13 +776,15 @@ def solve(model, strain, tension, from_drive, from_load, drive, load, first, bud
             drive_now[i] = drive[i] if here == 1.0 else first_drive[i] + here * (drive[i] - first_drive[i])
         for i in range(load.size):
             load_now[i] = load[i] if here == 1.0 else first_load[i] + here * (load[i] - first_load[i])
-        converged, worst, iterations = newton(model, strain, tension, drive_now, load_now, moved, ws)
+        converged, worst, iterations, size = newton(model, strain, tension, drive_now, load_now, moved, ws)
         spent += iterations
+        work += iterations + 1
         if converged:
+            longest = max(longest, size)
             from_drive[:] = drive_now
             from_load[:] = load_now
             if here == 1.0:
-                return rung, worst, spent, 1.0
+                return rung, worst, spent, 1.0, longest
             done, step = here, 2.0 * step
             good_strain[:] = strain
             good_tension[:] = tension
@@ -789,8 +793,8 @@ def solve(model, strain, tension, from_drive, from_load, drive, load, first, bud
         tension[:] = good_tension
         step = FIRST_SUBSTEP if rung == WARM else 0.5 * step
         rung = SUBSTEPS
-        if step < SMALLEST_SUBSTEP or spent >= budget or not model.ladder:
-            return FAILED, worst, spent, min(0.5, step / (1.0 - done))
+        if step < SMALLEST_SUBSTEP or work >= budget or not model.ladder:
+            return FAILED, worst, spent, min(0.5, step / (1.0 - done)), longest
 
 
 def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, first=1.0):
@@ -811,9 +815,9 @@ def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip,
     lengths : (N, n) array
         Out: path lengths [m]; unchanged where there was no answer.
     report : (N, REPORT) array
-        Out: rung (WARM, SUBSTEPS or FAILED), dimensionless residual, Newton iterations, and: jumped (0); of a lane that
-        FAILED, the substep to go on with. Such a lane is at the end of its branch (the substep is below SMALLEST_SUBSTEP) or
-        has done `budget` iterations.
+        Out: rung (WARM, SUBSTEPS or FAILED), dimensionless residual, Newton iterations, jumped (0; of a lane that FAILED, the
+        substep to go on with), largest first step of a Newton (rotation [rad] and stretch). A lane that FAILED is at the end of
+        its branch (the substep is below SMALLEST_SUBSTEP) or has done `budget` iterations.
     first : float
         Substep to begin with, as a share of the way: 1 but for a lane that goes on.
     """
@@ -837,7 +841,7 @@ def compile_kernels():
 
 def budget(model):
     """Return the Newton iterations after which `solve_lanes` gives a lane up, so that someone can look at the clock."""
-    return max(MAX_ITERATIONS, WORK // len(model.mass_below))
+    return max(MAX_ITERATIONS, WORK // (len(model.mass_below) * max(1, model.route.shape[1] // 4)))
 
 
 @entry
@@ -852,10 +856,11 @@ def _solve_lanes(
     )  # fmt: skip
     ws = workspace(model)
     for lane in range(strain.shape[0]):
-        rung, worst, iterations, step = solve(
+        rung, worst, iterations, step, longest = solve(
             model, strain[lane], tension[lane], from_drive[lane], from_load[lane], drive[lane], load[lane], first, budget, ws
         )
         report[lane, 0], report[lane, 1], report[lane, 2], report[lane, 3] = rung, worst, iterations, 0.0
+        report[lane, 4] = longest
         if rung == FAILED:
             report[lane, 3] = step
             continue
@@ -940,8 +945,9 @@ def linearise(model, strain, tension, drive, load, damping, slaved, ask, given):
                         model.kind[i], model.parameters, i, model.rest_length[i], ws.length[i], drive[i], tension[i]
                     )
     numbers[0], numbers[1] = worst, total
+    numbers[3] = 1.0  # what is no configuration is not stable
     if worst < np.inf:
-        numbers[2] = _energy(model, strain, tension, load, ws)
+        numbers[2], numbers[3] = _energy(model, strain, tension, load, ws), 0.0
         if ask != SHAPE:
             numbers[3] = eliminate(model, strain, tension, load, damping, ws)
         if ask >= GIVEN:

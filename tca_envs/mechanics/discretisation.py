@@ -142,8 +142,12 @@ def _hardest(arm: Arm, drive: Array, load: Array) -> Known:
     elements = [_elements(module) for module in arm.modules]
     coarse, middling = [Grid(e, 5 if e == 1 else 4) for e in elements], [Grid(e, 7 if e == 1 else 6) for e in elements]
     rough = _on(arm, coarse, 1e-3)
-    start = (np.tile(x, (len(drive), *[1] * x.ndim)) for x in rough.unloaded())
-    first = _solve(rough, ladder.solve, drive, load, *start)
+    start = [np.tile(x, (len(drive), *[1] * x.ndim)) for x in rough.unloaded()]
+    first = _solve(rough, _in_substeps, drive, load, *(x.copy() for x in start))
+    beyond = ~first.found  # a branch's end, most of them
+    fallen = _solve(rough, ladder.solve, drive[beyond], load[beyond], *(x[beyond] for x in start))
+    for values, new in zip(first[1:], fallen[1:], strict=True):
+        values[beyond] = new
     known = _carried(first.some(first.found), _on(arm, middling, 1e-6))
     known = known.some(known.found)
     # Both to the same small residual, so that the grids alone make the difference.
@@ -204,6 +208,10 @@ def _carried(known: Known, arm: Arm, off: float = 0.0) -> Known:
         strain -= off * (strain - arm.unloaded()[0])
     start = (strain, known.tension.copy(), known.drive.copy(), known.load.copy())
     return _solve(arm, _straight, known.drive, known.load, *start)
+
+
+def _in_substeps(arm: Arm, *lanes: Array) -> None:
+    solve_lanes(arm.model, *lanes)
 
 
 def _straight(arm: Arm, *lanes: Array) -> None:

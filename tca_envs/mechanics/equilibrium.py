@@ -55,7 +55,7 @@ class Equilibrium:
     residual : float
         Dimensionless: the largest of |moment imbalance| L/EI (an angle over the module; GJ in torsion), |force
         imbalance|/GA (a strain; EA along the axis) and |muscle length mismatch|/rest length over all nodes and muscles.
-        `shooting` scales its own, see `shooting.residual`.
+        `shooting` scales its own, see `shooting.residual`. Where nothing was found, that of the last try.
     iterations : int
         Newton iterations (evaluations of the residual for `shooting`).
     message : str

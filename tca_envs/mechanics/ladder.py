@@ -43,7 +43,9 @@ PAST = 1.0 / 256.0
 """A fall happens so far beyond the end of a branch, as a share of what is left of the way; the next one twice as far."""
 MAX_FALLS = 12
 ALIKE = 0.1
-"""Strains that differ by less, curvature times length [rad] and stretch, are taken for those of the same branch."""
+"""Strains that differ by less, curvature times the arm's length [rad] and stretch, are taken for those of the same branch."""
+LONG = 0.25
+"""A step whose first Newton step is longer, rotation [rad] and stretch, or that takes substeps, is checked by going back."""
 MAX_DESCENT = 300
 """Steps of one fall."""
 FALL_STEP = 0.3
@@ -132,13 +134,15 @@ def climb(
     """
     reasons: list[str] = []
     way = np.concatenate([drive - start.drive, load - start.load])
-    unit = way / max(float(way @ way), 1e-300)
+    scale = max(float(np.abs(way).max(initial=0.0)), 1e-150)
+    unit = way / scale
+    unit /= max(float(unit @ unit), 1e-150)
     iterations = 0
     # What may come between two looks at the clock: a call of the compiled rung, on the finer grid.
     deadline = begun + 0.9 * time_limit_s - 2.0 * (time.perf_counter() - begun)
 
     def gone(lane: Lane) -> str:
-        share = unit @ np.concatenate([lane.drive - start.drive, lane.load - start.load])
+        share = unit @ (np.concatenate([lane.drive - start.drive, lane.load - start.load]) / scale)
         return f"{100.0 * share:.3g} % of the way"
 
     def late() -> bool:
@@ -151,16 +155,20 @@ def climb(
     here = _follow(arm.model, stuck, drive, load, deadline, step)
     iterations += here.iterations
     if here.reached:
-        return end(SUBSTEPS, arm, here, False)
+        return end(SUBSTEPS, arm, here, not returns(arm.model, here.lane, start, deadline))
     reasons.append(f"substeps end at {gone(here.lane)}")
     # Where a branch ends, a grid's error decides on much: from here on with less of it.
     finer, rung, jumped = arm.finer, FINER, False
     if finer is not arm:
-        here = _follow(finer.model, arm.on(finer, here.lane), drive, load, deadline, CAREFUL)
+        edge = arm.on(finer, here.lane)
+        here = _follow(finer.model, edge, drive, load, deadline, CAREFUL)
         iterations += here.iterations
+        if here.reached:
+            jumped = not returns(finer.model, here.lane, edge, deadline)
+        else:
+            reasons.append(f"those on a finer grid at {gone(here.lane)}")
     if not here.reached:
         rung = DESCENT
-        reasons.append(f"those on a finer grid at {gone(here.lane)}")
     for fall in range(MAX_FALLS):
         if here.reached or late():
             break
@@ -174,12 +182,11 @@ def climb(
         if fallen is None:
             reasons.append(f"the fall from {gone(edge)} finds no equilibrium")
             break
-        again = _follow(finer.model, fallen, edge.drive, edge.load, deadline)
-        jump = not _alike(finer.model, again.lane, edge)
+        jump = not returns(finer.model, fallen, edge, deadline)
         jumped |= jump
         reasons.append(f"{'fell' if jump else 'went down'} at {gone(edge)}")
         here = _follow(finer.model, fallen, drive, load, deadline)
-        iterations += again.iterations + here.iterations
+        iterations += here.iterations
     if not here.reached:
         if late():
             reasons.append("the time limit is reached")
@@ -204,10 +211,14 @@ def solve(
     start = (strain.copy(), tension.copy(), from_drive.copy(), from_load.copy())
     lanes = (strain, tension, from_drive, from_load)
     solve_lanes(arm.model, *lanes, drive, load, tip, lengths, report)
+    long = (report[:, 0] == SUBSTEPS) | (report[:, 4] > LONG)
+    for i in np.flatnonzero(long & (report[:, 0] != FAILED)):
+        known, there = (Lane(*(values[i] for values in kind)) for kind in (start, lanes))
+        report[i, 3] = not returns(arm.model, there, known, time.perf_counter() + TIME_LIMIT_S)
     for i in np.flatnonzero(report[:, 0] == FAILED):
         known, stuck = (Lane(*(values[i].copy() for values in kind)) for kind in (start, lanes))
         found = climb(arm, known, stuck, drive[i], load[i], report[i, 3], time.perf_counter(), TIME_LIMIT_S)
-        report[i] = found.rung, found.residual, report[i, 2] + found.iterations, found.jumped
+        report[i, :4] = found.rung, found.residual, report[i, 2] + found.iterations, found.jumped
         answer = known
         if found.rung != FAILED:
             answer, tip[i], lengths[i] = found.arm.on(arm, found.lane), found.tip, found.lengths
@@ -222,17 +233,21 @@ def _shortest(model: Model, lane: Lane) -> float:
     return float(np.sqrt(squares.min(initial=np.inf)))
 
 
-def _alike(model: Model, one: Lane, other: Lane) -> bool:
-    """Return whether two states are the same."""
-    span = np.repeat(model.length, model.elements * model.nodes)[:, np.newaxis]
-    apart = np.abs(one.strain - other.strain)
-    return bool((apart[:, :3] * span).max() < ALIKE and apart[:, 3:].max() < ALIKE)
+def returns(model: Model, lane: Lane, start: Lane, deadline: float) -> bool:
+    """Return whether an arm that goes back to the drive and load of where it came from comes back to that state.
+
+    If it does, it has not left its branch of equilibria.
+    """
+    back = _follow(model, lane, start.drive, start.load, deadline)
+    apart = np.abs(back.lane.strain - start.strain)
+    return bool((apart[:, :3] * model.length.sum()).max() < ALIKE and apart[:, 3:].max() < ALIKE)
 
 
 def _follow(model: Model, lane: Lane, drive: Array, load: Array, deadline: float, step: float = 1.0) -> _Followed:
     """Follow a branch by the compiled ladder, as far as it goes before the deadline."""
     strain, tension, from_drive, from_load = (values[np.newaxis].copy() for values in lane)
-    tip, lengths, report = np.eye(4)[np.newaxis], np.empty((1, drive.size)), np.full((1, REPORT), FAILED, dtype=np.float64)
+    tip, lengths, report = np.eye(4)[np.newaxis], np.empty((1, drive.size)), np.full((1, REPORT), np.inf)
+    report[0, 0] = FAILED
     iterations = 0
     while step >= SMALLEST_SUBSTEP and time.perf_counter() < deadline:
         solve_lanes(

@@ -483,6 +483,12 @@ def _end(problem: Problem, unknowns: Array) -> tuple[Array, Array]:
     return trajectory.tip_pose, rows
 
 
+def stability(problem: Problem, sample: "Sampler", tension: Array) -> float:
+    """Return `Equilibrium.stability` of a solved problem, by the tangent on the arm's own grid."""
+    arm = problem.arm
+    return smallest_eigenvalue(arm.model, sample(arm.node_arc)[1], tension, problem.drive, problem.load)
+
+
 def _by_module(arm: Arm, tension: Array) -> list[Array]:
     """Return the tensions (n,) split into those of each module."""
     return np.split(tension, np.cumsum([len(module.muscles) for module in arm.modules])[:-1])
@@ -492,10 +498,6 @@ def _result(problem: Problem, solved: Problem, unknowns: Array, report: Report) 
     """Return the answer to `problem`: the shape that solves `solved`, which is another one where none was found."""
     trajectory = integrate(solved, unknowns, dense=True)
     sample = Sampler(problem.arm, trajectory.pieces)
-
-    def certify() -> float:
-        arm = problem.arm
-        return smallest_eigenvalue(arm.model, sample(arm.node_arc)[1], unknowns[6:], solved.drive, solved.load)
 
     return Equilibrium(
         tip_pose=trajectory.tip_pose,
@@ -509,6 +511,6 @@ def _result(problem: Problem, solved: Problem, unknowns: Array, report: Report) 
         jumped=False,
         sample=sample,
         differentiate=partial(tip_jacobian, solved, unknowns),
-        certify=certify,
+        certify=partial(stability, solved, sample, unknowns[6:]),
         **report,
     )

@@ -289,7 +289,7 @@ def drive(name: str, policy: str, steps: int, progress: Callable[[Iterable[int]]
 
 
 def stability_of(core: Core, lane: int) -> float:
-    """Return `Equilibrium.stability` of the state in which a lane is, on the grid on which it was found; nan if not found again."""
+    """Return `Equilibrium.stability` of a lane's state, on the grid on which it was found; nan if not found again."""
     arm, record = core.arm, core.record
     state = Lane(record.strain[lane], record.tension[lane], record.drive[lane], record.load[lane])
     here = linearise(arm.model, state.strain, state.tension.copy(), *state[2:], 0.0, False, SHAPE, state.strain)
