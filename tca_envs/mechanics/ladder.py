@@ -24,6 +24,7 @@ from tca_envs.mechanics.collocation import (
     SMALLEST_SUBSTEP,
     STEP,
     SUBSTEPS,
+    WARM,
     Model,
     compile_kernels,
     linearise,
@@ -211,6 +212,8 @@ def solve(
     start = (strain.copy(), tension.copy(), from_drive.copy(), from_load.copy())
     lanes = (strain, tension, from_drive, from_load)
     solve_lanes(arm.model, *lanes, drive, load, tip, lengths, report)
+    if not ((report[:, 0] != WARM) | (report[:, 4] > LONG)).any():
+        return
     long = (report[:, 0] == SUBSTEPS) | (report[:, 4] > LONG)
     for i in np.flatnonzero(long & (report[:, 0] != FAILED)):
         known, there = (Lane(*(values[i] for values in kind)) for kind in (start, lanes))
