@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from agents.scripted import CONTROLLERS
@@ -19,6 +20,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.S)
 
+PAPER = "the paper's shooting"
 BEATEN_BY: list[tuple[str, str, str]] = [("one-degree", "passive muscles ignored", "default")]
 """Scene, method and setting of points on the charts that are both faster and more accurate than one of this package's."""
 
@@ -152,3 +154,32 @@ def test_who_beats_this_package_is_said():
         theirs = [point for point in points if point.scene == scene and point.method != OURS]
         winners |= {(scene, point.method, point.setting) for point, _ in beaten(ours, theirs)}
     assert sorted(winners) == sorted(BEATEN_BY)
+
+
+def test_where_methods_fail_is_that_of_the_study():
+    with (ROOT / "docs/study/stability.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    names = list(dict.fromkeys(row["method"] for row in rows))
+    by_name = {name: [row for row in rows if row["method"] == name and not row["lost"] + row["doubt"]] for name in names}
+
+    def share(name: str, outcome: str) -> float:
+        return 100.0 * sum(row["outcome"] == outcome for row in by_name[name]) / len(by_name[name])
+
+    mine = names[0]
+    assert f"*{sum(row['method'] == mine for row in rows)} cells" in README
+    assert f"of the {len(by_name[mine])} cells that have a right answer" in README
+    assert share(mine, "right") == 100.0
+    assert f"{share('wrench shooting, RK4', 'unstable'):.0f} % of wrench shooting's" in README
+    bvp = "boundary value problem (SciPy solve_bvp)"
+    assert f"and {share(bvp, 'unstable'):.0f} % of `solve_bvp`'s end" in README
+    assert f"with {share(bvp, 'right'):.0f} % right" in README
+    assert f"on {100.0 - share(PAPER, 'right'):.0f} % of all cells" in README
+    assert f"good first guess on {100.0 - share(f'{PAPER}, good start', 'right'):.0f} %" in README
+    median = float(np.median([float(row["seconds"]) for row in by_name[mine]]))
+    assert f"in a median of {1e3 * median:.1f} ms" in README
+    with (ROOT / "docs/study/torture.csv").open(newline="", encoding="utf-8") as file:
+        runs = list(csv.DictReader(file))
+    assert len(runs) == 15 and all(int(run["steps"]) >= 100_000 for run in runs)
+    assert all(int(run["failed"]) == int(run["not_finite"]) == 0 for run in runs)
+    assert f"{sum(int(run['steps']) for run in runs):,} steps" in README
+    assert f"took {1e3 * max(float(run['max_cpu_s']) for run in runs):.1f} ms of processor time" in README
