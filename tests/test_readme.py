@@ -132,18 +132,36 @@ def test_the_chart_covers_all_scenes():
     assert {point.scene for point in measured()} == set(SCENES)
 
 
-@pytest.mark.parametrize("method", ["the paper's shooting", "boundary value problem (SciPy solve_bvp)"])
-def test_ratios_are_those_of_the_chart(method):
-    """Of warm solves at equal or better accuracy, over all scenes."""
+def warm_ratios(method: str) -> dict[str, list[float]]:
+    """Scene -> time of a method's settings over this package's, at equal or better accuracy, of warm solves."""
     points = [point for point in measured() if point.start == "warm"]
-    ratios = []
+    ratios = {}
     for scene in SCENES:
         ours = [point for point in points if point.scene == scene and point.method == OURS]
         theirs = [point for point in points if point.scene == scene and point.method == method and point.solved]
-        ratios += [value for value in (ratio(ours, point) for point in theirs) if value > 0.0]
+        ratios[scene] = [value for value in (ratio(ours, point) for point in theirs) if value > 0.0]
+    return ratios
+
+
+@pytest.mark.parametrize("method", [PAPER, "boundary value problem (SciPy solve_bvp)"])
+def test_ratios_are_those_of_the_chart(method):
+    """Of warm solves at equal or better accuracy, over all scenes."""
+    ratios = [value for values in warm_ratios(method).values() for value in values]
     assert f"{spread(min(ratios), max(ratios))} times" in README, spread(min(ratios), max(ratios))
-    if method == "the paper's shooting":
-        assert min(ratios) > 900.0
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        *(name for name in SCENES if name not in ("cold", "long", "heavy")),
+        pytest.param(
+            "heavy", marks=pytest.mark.xfail(strict=True, reason="920 at the loosest setting: certificates cost time")
+        ),
+    ],
+)
+def test_the_papers_method_takes_a_thousand_times_as_long(scene):
+    """Cold and on the long rod its warm solves have nothing to compare."""
+    assert min(warm_ratios(PAPER)[scene]) > 1000.0
 
 
 def test_who_beats_this_package_is_said():
