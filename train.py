@@ -3,6 +3,7 @@
 python train.py [--task reach] [--algo sac] [--steps N] [--seed S]      train and evaluate
 python train.py --resume runs/reach-sac-seed0                           go on with a run
 python train.py --eval-only runs/reach-sac-seed0                        evaluate a run
+python train.py --engine ray [--workers N] [--address A] [--seeds S S]  PPO by Ray RLlib, on several cores or machines
 """
 
 import argparse
@@ -39,8 +40,13 @@ CURVE_INTERVAL = 2_000
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     options = parse(arguments)
+    return run_seeds(options) if options.seeds else run(options)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Train or evaluate as asked; returns the exit status."""
     source = options.eval_only or options.resume
-    task, algorithm = options.task, options.algo
+    task, algorithm, engine = options.task, options.algo, options.engine
     if source is not None:
         description = read_description(source)
         task = description["task"]
@@ -50,31 +56,34 @@ def main(arguments: list[str] | None = None) -> int:
             fail(f"{source} holds a policy of {description['algo']!r}, not {algorithm!r}")
         algorithm = description["algo"]
         options.seed = description.get("seed", options.seed)
+        engine = description.get("engine", engine)
     task = task or "reach"
-    algorithm = algorithm or DEFAULT_ALGORITHM[task]
+    algorithm = algorithm or ("ppo" if engine == "ray" else DEFAULT_ALGORITHM[task])
     if algorithm not in HYPERPARAMETERS[task]:
         fail(f"--algo {algorithm}: not for the task {task!r}, whose algorithms are {', '.join(HYPERPARAMETERS[task])}")
+    if engine == "ray" and (algorithm != "ppo" or options.device != "cpu"):
+        fail(f"--engine ray trains ppo on the cpu, not {algorithm} on {options.device}")
     settings = dict(HYPERPARAMETERS[task][algorithm])
     import torch
 
     torch.set_num_threads(options.threads)
     if options.resume:
-        model = load(options.resume / "last.zip", algorithm, settings, options)
+        model = load(options.resume / "last.zip", algorithm, settings, options, engine)
         buffer = options.resume / "replay_buffer.pkl"
         if buffer.exists():
             model.load_replay_buffer(buffer)
     elif options.eval_only:
         model = load(options.eval_only / "policy.zip", algorithm, settings, options)
     else:
-        model = build(algorithm, settings, options)
-    folder = source or options.out or Path("runs") / f"{task}-{algorithm}-seed{options.seed}"
+        model = build(algorithm, settings, options, engine)
+    folder = source or options.out or Path("runs") / run_name(task, algorithm, engine, options.seed)
     seconds = 0.0
     if not options.eval_only:
         folder.mkdir(parents=True, exist_ok=True)
         if not options.resume:
             for name in ARTEFACTS:  # of an earlier run in the same folder
                 (folder / name).unlink(missing_ok=True)
-        seconds, interrupted = train(model, task, algorithm, settings, options, folder)
+        seconds, interrupted = train(model, task, algorithm, settings, options, folder, engine)
         print(f"saved the policy, curve.csv and curve.png in {folder}")
         if interrupted:
             print(f"interrupted after {model.num_timesteps} steps; go on with: python train.py --resume {folder}")
@@ -84,17 +93,39 @@ def main(arguments: list[str] | None = None) -> int:
     report = {
         "task": task,
         "algo": algorithm,
+        "engine": engine,
         "env": settings["env"],
         "seed": options.seed,
         "policy_steps": model.num_timesteps,
         "training_seconds": round(seconds, 1),
         "evaluation_seed": EVALUATION_SEED,
-        "versions": versions(),
+        "versions": versions(engine),
         "held_out": {name: asdict(result) for name, result in reports.items()},
     }
     path = folder / ("evaluation.json" if options.eval_only else "report.json")
     path.write_text(json.dumps(report, indent=2) + "\n")
     print(f"wrote {path}")
+    return 0
+
+
+def run_name(task: str, algorithm: str, engine: str, seed: int) -> str:
+    """Return the name of a run's folder."""
+    return f"{task}-{algorithm}{'-ray' if engine == 'ray' else ''}-seed{seed}"
+
+
+def run_seeds(options: argparse.Namespace) -> int:
+    """Train with each of the seeds, as many at a time as there are processors for; returns the exit status."""
+    task = options.task or "reach"
+    parent = (options.out or Path("runs")).absolute()
+
+    def trial(seed: int) -> dict[str, Any]:
+        folder = parent / run_name(task, "ppo", "ray", seed)
+        run(argparse.Namespace(**{**vars(options), "seed": seed, "out": folder}))
+        return json.loads((folder / "report.json").read_text())["held_out"]["ppo"]
+
+    results = ray_engine().run_trials(trial, options.seeds, options.workers, options.address)
+    for seed, result in zip(options.seeds, results, strict=True):
+        print(f"seed {seed}: {result}")
     return 0
 
 
@@ -111,17 +142,26 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--episodes", type=int, default=200, help="held-out episodes to evaluate (default: 200)")
     parser.add_argument("--threads", type=int, default=1, help="threads of torch (default: 1: the networks are small)")
     parser.add_argument("--device", default="cpu", help="torch device (default: cpu)")
+    parser.add_argument("--engine", default="sb3", help="sb3 (in one process) or ray (ppo with workers) (default: sb3)")
+    parser.add_argument("--workers", type=int, default=1, help="with ray: processes that step environments (default: 1)")
+    parser.add_argument("--address", help="with ray: of a running cluster (default: start one on this machine)")
+    parser.add_argument("--seeds", type=int, nargs="+", help="with ray: train once with each, side by side")
     options = parser.parse_args(arguments)
     if options.task is not None and options.task not in HYPERPARAMETERS:
         fail(f"--task {options.task}: unknown; the tasks are {', '.join(HYPERPARAMETERS)}")
     if options.algo is not None and options.algo not in ALGORITHMS:
         fail(f"--algo {options.algo}: unknown; the algorithms are {', '.join(ALGORITHMS)}")
-    for name in ("steps", "episodes", "threads"):
+    if options.engine not in ENGINES:
+        fail(f"--engine {options.engine}: unknown; the engines are {', '.join(ENGINES)}")
+    if options.seeds and options.engine != "ray":
+        fail("--seeds needs --engine ray")
+    for name in ("steps", "episodes", "threads", "workers"):
         value = getattr(options, name)
         if value is not None and value < 1:
             fail(f"--{name} {value}: expected a positive integer")
-    if options.seed < 0:
-        fail(f"--seed {options.seed}: expected an integer of at least 0")
+    for name, seeds in (("seed", [options.seed]), ("seeds", options.seeds or [])):
+        if min(seeds, default=0) < 0:
+            fail(f"--{name} {' '.join(map(str, seeds))}: expected integers of at least 0")
     if options.eval_only is not None and options.resume is not None:
         fail("--eval-only and --resume exclude each other")
     return options
@@ -150,13 +190,25 @@ def read_description(folder: Path) -> dict[str, Any]:
     return description
 
 
-def learner(algorithm: str) -> Any:
+def learner(algorithm: str, engine: str) -> Any:
     """Return the class of an algorithm: Stable-Baselines3's or our own in its form."""
     import stable_baselines3
+
+    if engine == "ray":
+        return ray_engine().RayPPO
 
     from agents.dagger import DAgger
 
     return DAgger if algorithm == "dagger" else getattr(stable_baselines3, algorithm.upper())
+
+
+def ray_engine() -> Any:
+    """Return the module that trains with Ray; prints a message and exits with 2 if Ray is missing."""
+    try:
+        from agents import ray_engine
+    except ModuleNotFoundError as error:
+        fail(f"--engine ray needs Ray: pip install -e '.[train,ray]' ({error})")
+    return ray_engine
 
 
 def environments(settings: dict[str, Any], seed: int) -> Any:
@@ -174,18 +226,20 @@ def environments(settings: dict[str, Any], seed: int) -> Any:
     return make_vec_env(make, n_envs=settings["envs"], seed=seed)
 
 
-def build(algorithm: str, settings: dict[str, Any], options: argparse.Namespace) -> Any:
+def build(algorithm: str, settings: dict[str, Any], options: argparse.Namespace, engine: str) -> Any:
     """Return a fresh model."""
     extra = {name: value for name, value in settings.items() if name not in ("env", "steps", "envs", "done_steps")}
-    return learner(algorithm)(
+    if engine == "ray":
+        extra |= {"env_id": settings["env"], "workers": options.workers, "address": options.address}
+    return learner(algorithm, engine)(
         "MultiInputPolicy", environments(settings, options.seed), seed=options.seed, device=options.device, **extra
     )
 
 
-def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse.Namespace) -> Any:
+def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse.Namespace, engine: str = "sb3") -> Any:
     """Return a saved model; prints a message and exits with 2 if it is none or was made for other spaces."""
     try:
-        model = learner(algorithm).load(path, device=options.device)
+        model = learner(algorithm, engine).load(path, device=options.device)
     except Exception as error:  # SB3 passes on whatever torch, pickle and zipfile raise
         fail(f"{path}: expected a {algorithm} policy that this version of stable-baselines3 reads ({error})")
     env = environments(settings, options.seed + model.num_timesteps)  # goals go on, not again
@@ -193,11 +247,19 @@ def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse
         if getattr(model, name) != getattr(env, name):
             fail(f"{path}: made for the {name} {getattr(model, name)}, but {settings['env']} has {getattr(env, name)}")
     model.set_env(env)
+    if engine == "ray":
+        model.workers, model.address = options.workers, options.address
     return model
 
 
 def train(
-    model: Any, task: str, algorithm: str, settings: dict[str, Any], options: argparse.Namespace, folder: Path
+    model: Any,
+    task: str,
+    algorithm: str,
+    settings: dict[str, Any],
+    options: argparse.Namespace,
+    folder: Path,
+    engine: str,
 ) -> tuple[float, bool]:
     """Train, save and draw the learning curve; returns the seconds taken and whether Ctrl-C ended it.
 
@@ -246,9 +308,10 @@ def train(
     description = {
         "task": task,
         "algo": algorithm,
+        "engine": engine,
         "seed": options.seed,
         "env": settings["env"],
-        "versions": versions(),
+        "versions": versions(engine),
     }
     (folder / "policy.json").write_text(json.dumps(description, indent=2) + "\n")
     interrupted = False
@@ -266,6 +329,7 @@ def train(
     return seconds, interrupted
 
 
+ENGINES = ("sb3", "ray")
 CURVE_COLUMNS = ("steps", "seconds", "success_rate", "final_distance_mm", "episode_return")
 
 
@@ -325,9 +389,9 @@ def compare(model: Any, task: str, algorithm: str, settings: dict[str, Any], epi
     return reports
 
 
-def versions() -> dict[str, str]:
+def versions(engine: str) -> dict[str, str]:
     """Return the versions that made a policy."""
-    names = ("tca_envs", "gymnasium", "stable_baselines3", "torch", "numpy", "numba")
+    names = ("tca_envs", "gymnasium", "stable_baselines3", "torch", "numpy", "numba", *(["ray"] if engine == "ray" else []))
     return {"python": platform.python_version(), **{name: version(name) for name in names}}
 
 
