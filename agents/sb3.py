@@ -17,7 +17,7 @@ Observations = dict[str, NDArray[Any]]
 Step = tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]
 
 
-def make(name: str, lanes: int, seed: int | None = None, held_steps: int | None = None, **options: Any) -> "BatchVecEnv":
+def make(name: str, lanes: int, seed: int | None = None, done_steps: int | None = None, **options: Any) -> "BatchVecEnv":
     """Return a batch of environments for a learner of Stable-Baselines3.
 
     Parameters
@@ -28,7 +28,7 @@ def make(name: str, lanes: int, seed: int | None = None, held_steps: int | None 
         How many.
     seed : int, optional
         Lane i starts with `seed` + i.
-    held_steps : int, optional
+    done_steps : int, optional
         See `BatchVecEnv`.
     **options
         Arguments of the environment.
@@ -40,7 +40,7 @@ def make(name: str, lanes: int, seed: int | None = None, held_steps: int | None 
     vector = gymnasium.make_vec(
         name, lanes, vectorization_mode="sync", vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED}, **options
     )
-    env = BatchVecEnv(vector, held_steps)
+    env = BatchVecEnv(vector, done_steps)
     env.seed(seed)
     return env
 
@@ -56,7 +56,7 @@ class BatchVecEnv(VecEnv):
     ----------
     env : gymnasium.vector.VectorEnv
         Its observations are dictionaries of arrays and its autoreset mode is DISABLED: this class resets.
-    held_steps : int, optional
+    done_steps : int, optional
         End episodes, as truncated, whose goal has been held for so many steps (`info["is_success"]`).
 
     Raises
@@ -65,17 +65,17 @@ class BatchVecEnv(VecEnv):
         If an argument is none of these.
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], held_steps: int | None = None) -> None:
+    def __init__(self, env: VectorEnv[Any, Any, Any], done_steps: int | None = None) -> None:
         if not isinstance(env, VectorEnv):
             raise ValueError(f"env = {env!r}: expected a gymnasium.vector.VectorEnv")
         if env.metadata.get("autoreset_mode") != AutoresetMode.DISABLED:
             raise ValueError(f"env has autoreset_mode {env.metadata.get('autoreset_mode')}: expected {AutoresetMode.DISABLED}")
         if not isinstance(env.single_observation_space, gymnasium.spaces.Dict):
             raise ValueError(f"env has observations of {env.single_observation_space}: expected a dictionary")
-        if held_steps is not None and (not isinstance(held_steps, int) or held_steps < 1):
-            raise ValueError(f"held_steps = {held_steps!r}: expected a positive integer")
+        if done_steps is not None and (not isinstance(done_steps, int) or done_steps < 1):
+            raise ValueError(f"done_steps = {done_steps!r}: expected a positive integer")
         self.env = env
-        self.held_steps = held_steps
+        self.done_steps = done_steps
         self._held = np.zeros(env.num_envs, dtype=np.intp)
         self._actions: Any = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
@@ -102,9 +102,9 @@ class BatchVecEnv(VecEnv):
     def step_wait(self) -> Step:
         """Step with the actions noted; returns observations (N, ...), rewards (N,), ends (N,) and N infos."""
         observation, reward, terminated, truncated, infos = self.env.step(self._actions)
-        if self.held_steps is not None:
+        if self.done_steps is not None:
             self._held = np.where(infos["is_success"], self._held + 1, 0)
-            truncated = truncated | (self._held >= self.held_steps)
+            truncated = truncated | (self._held >= self.done_steps)
         done = terminated | truncated
         rows = by_lane(infos, np.arange(self.num_envs))
         for row, limited in zip(rows, (truncated & ~terminated).tolist(), strict=True):

@@ -58,13 +58,13 @@ class Script(gym.Env):
 SCRIPTS = ("--T", "---L", "-B", "-----T", "L")
 
 
-def scripted(scripts=SCRIPTS, held_steps=None, render_mode=None, **options):
+def scripted(scripts=SCRIPTS, done_steps=None, render_mode=None, **options):
     vector = SyncVectorEnv(
         [lambda script=script: Script(script, render_mode) for script in scripts],
         autoreset_mode=AutoresetMode.DISABLED,
         **options,
     )
-    return BatchVecEnv(vector, held_steps)
+    return BatchVecEnv(vector, done_steps)
 
 
 def assert_same(ours, theirs):
@@ -136,7 +136,7 @@ def test_nothing_that_was_returned_changes_later():
 
 @pytest.mark.parametrize(("script", "ends"), [("--sss-L", [5]), ("-ss-sssL", [7]), ("ss-ss-L", [7]), ("sssL", [3, 6])])
 def test_an_episode_ends_when_its_goal_was_held_long_enough(script, ends):
-    env = scripted((script, "-------------T"), held_steps=3)
+    env = scripted((script, "-------------T"), done_steps=3)
     env.reset()
     for step in range(1, ends[-1] + 1):
         *_, done, infos = env.step(np.zeros((2, 1), np.float32))
@@ -145,7 +145,7 @@ def test_an_episode_ends_when_its_goal_was_held_long_enough(script, ends):
 
 
 def test_a_goal_held_in_an_episode_that_was_left_does_not_count():
-    env = scripted(("ss-L",), held_steps=3)
+    env = scripted(("ss-L",), done_steps=3)
     env.reset()
     for _ in range(2):
         env.step(np.zeros((1, 1), np.float32))
@@ -201,8 +201,8 @@ def test_options_that_differ_are_refused():
     [
         (lambda: gym.make("TCAReach-v0"), None, r"expected a gymnasium\.vector\.VectorEnv"),
         (lambda: SyncVectorEnv([lambda: Script("L")]), None, r"autoreset_mode AutoresetMode\.NEXT_STEP: expected"),
-        (lambda: scripted().env, 0, "held_steps = 0: expected a positive integer"),
-        (lambda: scripted().env, 1.5, r"held_steps = 1\.5: expected a positive integer"),
+        (lambda: scripted().env, 0, "done_steps = 0: expected a positive integer"),
+        (lambda: scripted().env, 1.5, r"done_steps = 1\.5: expected a positive integer"),
     ],
 )
 def test_bad_arguments_are_refused(env, held, message):
