@@ -69,15 +69,16 @@ class BatchRunner(SingleAgentEnvRunner):
         """Make the batch of environments."""
         import tca_envs  # noqa: F401  (registers the environments in the worker's process)
 
-        self.env = gymnasium.make_vec(self.config.env, num_envs=self.config.num_envs_per_env_runner)
+        self.env: Any = gymnasium.make_vec(self.config.env, num_envs=self.config.num_envs_per_env_runner)
         self.num_envs = self.env.num_envs
+        self.low, self.high = self.env.single_action_space.low, self.env.single_action_space.high
         self._needs_initial_reset = True
         self._return, self._length = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=int)
 
     def _sample(
         self,
         *,
-        num_timesteps: int | None = None,
+        num_timesteps: int,
         num_episodes: int | None = None,
         explore: bool,
         random_actions: bool = False,
@@ -88,7 +89,6 @@ class BatchRunner(SingleAgentEnvRunner):
             self._now, _ = self.env.reset(seed=self._seed)
             self._over = np.zeros(self.num_envs, dtype=bool)
             self._needs_initial_reset = False
-        low, high = self.env.single_action_space.low, self.env.single_action_space.high
         steps, taken, episodes = [], 0, 0
         while taken < num_timesteps:
             seen = {key: torch.as_tensor(value) for key, value in self._now.items()}
@@ -96,7 +96,7 @@ class BatchRunner(SingleAgentEnvRunner):
             gaussian = TorchDiagGaussian.from_logits(inputs)
             action = gaussian.sample()
             extra = {Columns.ACTION_DIST_INPUTS: inputs.numpy(), Columns.ACTION_LOGP: gaussian.logp(action).numpy()}
-            after, reward, terminated, truncated, _ = self.env.step(np.clip(action.numpy(), low, high))
+            after, reward, terminated, truncated, _ = self.env.step(np.clip(action.numpy(), self.low, self.high))
             steps.append((self._now, action.numpy(), reward, terminated, truncated, ~self._over, extra))
             taken += self.num_envs - int(self._over.sum())
             self._return, self._length = self._return + reward, self._length + 1
@@ -205,7 +205,7 @@ class RayPPO(PPO):
                 num_epochs=self.n_epochs,
                 gamma=self.gamma,
                 lambda_=self.gae_lambda,
-                clip_param=self.clip_range(1.0),
+                clip_param=self.clip_range(1.0),  # type: ignore[operator]  # a function once the model is set up
                 vf_clip_param=float("inf"),
                 vf_loss_coeff=self.vf_coef,
                 entropy_coeff=self.ent_coef,
