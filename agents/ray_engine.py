@@ -71,7 +71,8 @@ class BatchRunner(SingleAgentEnvRunner):
 
         self.env: Any = gymnasium.make_vec(self.config.env, num_envs=self.config.num_envs_per_env_runner)
         self.num_envs = self.env.num_envs
-        self.low, self.high = self.env.single_action_space.low, self.env.single_action_space.high
+        space: Any = self.env.single_action_space
+        self.low, self.high = space.low, space.high
         self._needs_initial_reset = True
         self._return, self._length = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=int)
 
@@ -254,10 +255,21 @@ class RayPPO(PPO):
             weights, optimizer = learnt.get()
             self.policy.load_state_dict(weights)
             self.policy.optimizer.load_state_dict(optimizer)
+            self._log(result)
             for count in (*[self.n_envs] * (taken // self.n_envs), taken % self.n_envs):
                 self.num_timesteps += count
                 going_on = going_on and callbacks.on_step()
         callbacks.on_training_end()
+
+
+    def _log(self, result: dict[str, Any]) -> None:
+        episodes, learner = result["env_runners"], result["learners"]["default_policy"]
+        for name, key in (("ep_rew_mean", "episode_return_mean"), ("ep_len_mean", "episode_len_mean")):
+            if np.isfinite(episodes.get(key, np.nan)):  # some have ended
+                self.logger.record(f"rollout/{name}", float(episodes[key]))
+        for name in ("total_loss", "policy_loss", "vf_loss", "entropy", "vf_explained_var"):
+            self.logger.record(f"train/{name}", float(learner[name]))
+        self.logger.dump(self.num_timesteps)
 
 
 def optimizers(learner: Any) -> list[torch.optim.Optimizer]:
@@ -269,6 +281,7 @@ def connect(address: str | None, processors: int) -> bool:
     """Connect to a Ray cluster, or start a local one; returns whether that is new."""
     if ray.is_initialized():
         return False
+    logging.getLogger("ray.rllib").setLevel(logging.ERROR)
     quiet: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
     if address is None:
         ray.init(num_cpus=processors, include_dashboard=False, object_store_memory=OBJECT_STORE_BYTES, **quiet)
