@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import pickle
 import shutil
 import signal
@@ -101,8 +100,8 @@ def steps_of(folder):
 
 def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint_to_its_end(quickly, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "killed"
-    often = "import sys, train; train.CURVE_EPISODES = 1; train.CURVE_INTERVAL = 300; train.main(sys.argv[1:])"
-    command = [sys.executable, "-c", often, "--steps", "2400", "--seed", "5", "--out", str(folder)]
+    often = "import sys, train; train.CURVE_EPISODES = 1; train.CURVE_INTERVAL = 200; train.main(sys.argv[1:])"
+    command = [sys.executable, "-c", often, "--steps", "1400", "--seed", "5", "--out", str(folder)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
             while not (folder / "curve.csv").exists() or len(steps_of(folder)) < 4:
@@ -111,13 +110,13 @@ def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint_to_its_end(quick
         finally:
             process.kill()
     left = steps_of(folder)
-    assert left[:4] == [300, 600, 900, 1200] and left[-1] < 2400 and not (folder / "report.json").exists()
+    assert left[:4] == [200, 400, 600, 800] and left[-1] < 1400 and not (folder / "report.json").exists()
     assert quickly("--resume", folder) == 0
-    assert f"for {2400 - left[-1]} steps, seed 5" in capsys.readouterr().out
-    assert steps_of(folder) == [*left, 2400]
-    assert SAC.load(folder / "last.zip", device="cpu").num_timesteps == 2400
+    assert f"for {1400 - left[-1]} steps, seed 5" in capsys.readouterr().out
+    assert steps_of(folder) == [*left, 1400]
+    assert SAC.load(folder / "last.zip", device="cpu").num_timesteps == 1400
     with (folder / "replay_buffer.pkl").open("rb") as file:
-        assert pickle.load(file).size() >= 2400 // 4 - 1  # SB3 stores a step after it has told of it
+        assert pickle.load(file).size() >= 1400 // 4 - 1  # SB3 stores a step after it has told of it
     assert not list(folder.glob("new-*"))
 
 
@@ -127,11 +126,10 @@ def parameters(folder, name="policy.zip"):
         return saved.read("policy.pth")
 
 
-def test_the_same_command_makes_the_same_policy_whatever_the_threads_that_solve(trained, tmp_path):
+def test_the_same_command_makes_the_same_policy(trained, tmp_path):
+    """Whatever else the process did before."""
     folder, again = trained[0], tmp_path / "again"
-    command = "--steps", 1200, "--seed", 3, "--episodes", 2, "--out", again
-    done = run(*command, env={**os.environ, "NUMBA_NUM_THREADS": "1"})
-    assert done.returncode == 0, done.stderr
+    assert train.main(["--steps", "1200", "--seed", "3", "--episodes", "2", "--out", str(again)]) == 0
     assert parameters(folder) == parameters(again)
     rows = []
     for place in (folder, again):
