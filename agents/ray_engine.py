@@ -69,7 +69,7 @@ class BatchRunner(SingleAgentEnvRunner):
         """Make the batch of environments."""
         import tca_envs  # noqa: F401  (registers the environments in the worker's process)
 
-        self.env: Any = gymnasium.make_vec(self.config.env, num_envs=self.config.num_envs_per_env_runner)
+        self.env: Any = gymnasium.make_vec(self.config.env, self.config.num_envs_per_env_runner, threads=1)
         self.num_envs = self.env.num_envs
         space: Any = self.env.single_action_space
         self.low, self.high = space.low, space.high
@@ -261,7 +261,6 @@ class RayPPO(PPO):
                 going_on = going_on and callbacks.on_step()
         callbacks.on_training_end()
 
-
     def _log(self, result: dict[str, Any]) -> None:
         episodes, learner = result["env_runners"], result["learners"]["default_policy"]
         for name, key in (("ep_rew_mean", "episode_return_mean"), ("ep_len_mean", "episode_len_mean")):
@@ -284,7 +283,7 @@ def connect(address: str | None, processors: int) -> bool:
     logging.getLogger("ray.rllib").setLevel(logging.ERROR)
     quiet: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
     if address is None:
-        ray.init(num_cpus=processors, include_dashboard=False, object_store_memory=OBJECT_STORE_BYTES, **quiet)
+        ray.init("local", num_cpus=processors, include_dashboard=False, object_store_memory=OBJECT_STORE_BYTES, **quiet)
     else:
         ray.init(address=address, **quiet)
     return True
