@@ -30,6 +30,8 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 from stable_baselines3 import PPO
 from stable_baselines3.common.type_aliases import MaybeCallback
 
+import tca_envs  # noqa: F401  (registers the environments, in the workers' processes, too)
+
 SCHEDULE_POINTS = 20
 """A learning rate that changes is handed to RLlib as a line through so many points."""
 OBJECT_STORE_BYTES = 256 * 2**20
@@ -67,9 +69,9 @@ class BatchRunner(SingleAgentEnvRunner):
 
     def make_env(self) -> None:
         """Make the batch of environments."""
-        import tca_envs  # noqa: F401  (registers the environments in the worker's process)
-
-        self.env: Any = gymnasium.make_vec(self.config.env, self.config.num_envs_per_env_runner, threads=1)
+        self.env: Any = gymnasium.make_vec(
+            self.config.env, self.config.num_envs_per_env_runner, **self.config.env_config
+        )
         self.num_envs = self.env.num_envs
         space: Any = self.env.single_action_space
         self.low, self.high = space.low, space.high
@@ -192,7 +194,12 @@ class RayPPO(PPO):
         )
         return (
             PPOConfig()
-            .environment(self.env_id, observation_space=self.observation_space, action_space=self.action_space)
+            .environment(
+                self.env_id,
+                env_config={"threads": 1},  # a worker is a processor
+                observation_space=self.observation_space,
+                action_space=self.action_space,
+            )
             .env_runners(
                 env_runner_cls=BatchRunner,
                 num_env_runners=self.workers,
