@@ -114,8 +114,7 @@ def grip_times() -> tuple[float, float]:
     fits = np.interp(box.width, jaws.gap(pick_and_place.PINCH_AT), pick_and_place.PINCH_AT)
     needed = 0.5 * box.mass * presets.SITE.gravity / box.friction
     holds = np.interp(-needed, -pick_and_place.pinch_table(), pick_and_place.PINCH_AT)
-    opening, closing = (thermal.time_to_reach(*way, heating) for way in ((AMBIENT, fits), (fits, holds)))
-    return float(opening[0]), float(closing[0])
+    return float(thermal.time_to_reach(AMBIENT, fits, heating)[0]), float(thermal.time_to_reach(fits, holds, heating)[0])
 
 
 TIMES: dict[str, Callable[[Observation], float]] = {

@@ -375,7 +375,7 @@ def helix_temperature(arm: Arm, turn: float) -> float:
 
 
 def twisted(arm: Arm, turn: float | None) -> Array:
-    """Return where plans of the whole arm begin (s, 4) [degC]: `BENDING_STARTS`, the helix turned by about `turn` [rad] or cold."""
+    """Return where plans of the whole arm begin (s, 4) [degC]: `BENDING_STARTS`, the helix cold or turned by `turn` [rad]."""
     helix = AMBIENT if turn is None else helix_temperature(arm, turn)
     return np.column_stack([BENDING_STARTS, np.full(len(BENDING_STARTS), helix)])
 
