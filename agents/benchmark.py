@@ -340,7 +340,7 @@ def page(table: list[Row], runs: list[Run], jobs: int) -> str:
         f"*Success on {train.CURVE_EPISODES} goals of the training split, mean and range over the seeds.*",
         "## How it is measured",
         "An episode succeeds if its last step does: goals are to be held. Time to success is that from which on they are, mean "
-        "over the episodes that succeed; over the fastest: summed over them, and divided by the least time in which the heaters "
+        "over the episodes that succeed; over the fastest: summed over them, and divided by the least time in which heaters "
         "could do it, see `agents/fastest.py`. In PickAndPlace that leaves the stage and the release out, so nobody can come "
         "near 1. The final error is the distance from the goal at the end of the episode, mean over all episodes, and in "
         "TwistAlign that of the yaw. Training is the time of a whole training, the points of its learning curve included; the "
