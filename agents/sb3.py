@@ -37,9 +37,7 @@ def make(name: str, lanes: int, seed: int | None = None, done_steps: int | None 
     -------
     BatchVecEnv
     """
-    vector = gymnasium.make_vec(
-        name, lanes, vectorization_mode="sync", vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED}, **options
-    )
+    vector = gymnasium.make_vec(name, lanes, autoreset_mode=AutoresetMode.DISABLED, **options)
     env = BatchVecEnv(vector, done_steps)
     env.seed(seed)
     return env

@@ -168,6 +168,17 @@ def test_attributes_and_methods():
     assert env.env_is_wrapped(Monitor) == [False] * 5 and env.env_is_wrapped(Monitor, indices=0) == [False]
 
 
+def test_attributes_and_methods_of_the_native_batch():
+    env = make("TCAReach-v0", 3)
+    assert env.get_attr("reward") == ["sparse"] * 3 and env.get_attr("arm", 1)[0].muscles
+    assert env.has_attr("task") and not env.has_attr("depth") and env.render_mode is None
+    near, far = np.zeros((4, 3)), np.full((4, 3), 1.0)
+    for kind, expected in (("sparse", -1.0), ("dense", -(3.0**0.5))):
+        env.set_attr("reward", kind)
+        (reward,) = env.env_method("compute_reward", near, far, [{}] * 4, indices=[0])
+        np.testing.assert_allclose(reward, [expected] * 4, rtol=1e-6)
+
+
 def test_pictures_of_all_lanes_are_tiled():
     env = scripted(render_mode="rgb_array")
     assert env.render().shape == (3 * 4, 2 * 6, 3)
@@ -222,7 +233,7 @@ def test_a_bad_action_is_refused_and_changes_nothing():
     ours, theirs = make("TCAReach-v0", 2, seed=0), make("TCAReach-v0", 2, seed=0)
     for env in (ours, theirs):
         env.reset()
-    for action in (np.full((2, 3), np.nan), np.zeros((2, 2))):
+    for action in (np.array([[0.0] * 3, [np.nan] * 3]), np.zeros((2, 2)), np.zeros((3, 3))):
         with pytest.raises(ValueError):
             ours.step(action)
     action = np.ones((2, 3), np.float32)
