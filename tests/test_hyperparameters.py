@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from pydoc import locate
 
 import gymnasium as gym
 import pytest
@@ -29,7 +30,7 @@ def test_every_task_has_settings_of_its_default_and_every_file_an_algorithm():
 def test_files_are_by_environment_with_what_rl_zoo_needs(path):
     for env, entry in yaml.safe_load(path.read_text()).items():
         assert env in gym.registry
-        assert entry["policy"] == "MultiInputPolicy" and entry["n_timesteps"] > 0 and entry["n_envs"] > 0
+        assert locate(entry["policy"]) and entry["n_timesteps"] > 0 and entry["n_envs"] > 0
         # RL-Zoo splits strings at the "_", and YAML takes 1e-3 for a string.
         assert isinstance(entry["learning_rate"], float) or entry["learning_rate"].startswith("lin_")
         assert HYPERPARAMETERS[task_of(env)][path.stem] == {"env": env, **entry}
@@ -45,9 +46,9 @@ def test_learners_take_them(task, algorithm):
 
 
 def test_a_linear_schedule_falls_to_zero():
-    made = for_learner({"learning_rate": "lin_0.002", "n_envs": 3, "env": "x", "gamma": 0.9})
+    made = for_learner({"learning_rate": "lin_0.002", "n_envs": 3, "env": "x", "policy": "P", "gamma": 0.9})
     assert [made["learning_rate"](left) for left in (1.0, 0.5, 0.0)] == [0.002, 0.001, 0.0]
-    assert set(made) == {"learning_rate", "gamma"}
+    assert set(made) == {"learning_rate", "policy", "gamma"}
 
 
 @pytest.mark.parametrize(("task", "algorithm"), [entry for entry in ENTRIES if entry[1] != "dagger"])

@@ -11,6 +11,7 @@ goal has been held for so many steps. All else goes to the learner.
 
 from copy import deepcopy
 from pathlib import Path
+from pydoc import locate
 from typing import Any
 
 import gymnasium
@@ -51,6 +52,8 @@ def for_learner(settings: dict[str, Any]) -> dict[str, Any]:
     # Copies: learners write into the mappings that they are given.
     ours = ("env", "n_envs", "n_timesteps", "done_steps")
     made = {name: deepcopy(value) for name, value in settings.items() if name not in ours}
+    if "." in made["policy"]:
+        made["policy"] = locate(made["policy"])
     for name in SCHEDULES:
         if isinstance(made.get(name), str):
             made[name] = LinearSchedule(float(made[name].removeprefix("lin_")), 0.0, 1.0)
