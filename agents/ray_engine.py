@@ -69,9 +69,7 @@ class BatchRunner(SingleAgentEnvRunner):
 
     def make_env(self) -> None:
         """Make the batch of environments."""
-        self.env: Any = gymnasium.make_vec(
-            self.config.env, self.config.num_envs_per_env_runner, **self.config.env_config
-        )
+        self.env: Any = gymnasium.make_vec(self.config.env, self.config.num_envs_per_env_runner, **self.config.env_config)
         self.num_envs = self.env.num_envs
         space: Any = self.env.single_action_space
         self.low, self.high = space.low, space.high
@@ -183,7 +181,16 @@ class RayPPO(PPO):
         return [*super()._excluded_save_params(), "workers", "address"]  # where it ran is no part of what was learnt
 
     def config(self, steps: int) -> PPOConfig:
-        """Return RLlib's form of the settings, for training of so many steps from where the model stands."""
+        """Return RLlib's form of the settings, for training of so many steps from where the model stands.
+
+        Raises
+        ------
+        ValueError
+            If `clip_range` is a schedule, which RLlib's PPO does not have.
+        """
+        clip: Any = self.clip_range  # a function once the model is set up
+        if clip(0.0) != clip(1.0):
+            raise ValueError(f"clip_range = {clip!r}: expected a constant, RLlib's PPO has no other")
         done, total = self.num_timesteps, self.num_timesteps + steps
         fractions = np.linspace(0.0, 1.0, SCHEDULE_POINTS + 1)
         rates = [[int(part * steps), float(self.lr_schedule(1.0 - (done + part * steps) / total))] for part in fractions]
@@ -213,7 +220,7 @@ class RayPPO(PPO):
                 num_epochs=self.n_epochs,
                 gamma=self.gamma,
                 lambda_=self.gae_lambda,
-                clip_param=self.clip_range(1.0),  # type: ignore[operator]  # a function once the model is set up
+                clip_param=clip(1.0),
                 vf_clip_param=float("inf"),
                 vf_loss_coeff=self.vf_coef,
                 entropy_coeff=self.ent_coef,

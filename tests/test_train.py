@@ -215,15 +215,15 @@ def test_ray_is_needed_for_its_engine_only(monkeypatch, capsys):
         (["--algo", "dagger"], "--algo dagger: not for the task 'reach', whose algorithms are sac, ppo"),
         (["--steps", "0"], "--steps 0: expected a positive integer"),
         (["--episodes", "-3"], "--episodes -3: expected a positive integer"),
-        (["--seed", "-1"], "--seed -1: expected integers of at least 0"),
+        (["--seed", "-1"], "--seed -1: expected an integer of at least 0"),
         (["--eval-only", "nowhere"], "nowhere: expected the folder of a run"),
         (["--resume", "a", "--eval-only", "b"], "exclude each other"),
         (["--engine", "steam"], "--engine steam: unknown; the engines are sb3, ray"),
         (["--engine", "ray", "--algo", "sac"], "--engine ray trains ppo on the cpu, not sac on cpu"),
         (["--engine", "ray", "--device", "cuda"], "--engine ray trains ppo on the cpu, not ppo on cuda"),
         (["--engine", "ray", "--workers", "0"], "--workers 0: expected a positive integer"),
-        (["--engine", "ray", "--seeds", "1", "-2"], "--seeds 1 -2: expected integers of at least 0"),
-        (["--seeds", "1", "2"], "--seeds needs --engine ray"),
+        (["--engine", "ray", "--seeds", "1", "-2"], "--seeds -2: expected an integer of at least 0"),
+        (["--seeds", "1", "2"], "--seeds needs --benchmark or --engine ray"),
     ],
 )
 def test_bad_arguments_are_told(arguments, message, capsys):
