@@ -189,7 +189,7 @@ def test_settings_become_rllibs(address):
     assert config.train_batch_size_per_learner == 64 * 64
     assert (config.num_env_runners, config.num_envs_per_env_runner, config.seed) == (2, 32, 0)
     assert model(address).config(3000).lr == 1e-3
-    with pytest.raises(ValueError, match="clip_range = .*: expected a constant"):
+    with pytest.raises(ValueError, match=r"clip_range = .*: expected a constant"):
         model(address, clip_range=lambda left: 0.2 * left).config(3000)
 
 
