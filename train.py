@@ -10,8 +10,10 @@ python train.py --benchmark [--seeds 0 1 2] [--jobs 2]                  all algo
 
 import argparse
 import json
+import os
 import platform
 import sys
+from contextlib import ExitStack
 from dataclasses import asdict
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -51,7 +53,27 @@ def main(arguments: list[str] | None = None) -> int:
         tasks = [options.task] if options.task else list(HYPERPARAMETERS)
         benchmark(options.out or Path("docs/benchmark"), tasks, options.seeds or [0, 1, 2], options.jobs, options.quick)
         return 0
-    return run_seeds(options) if options.seeds else run(options)
+    if options.resume:
+        options.engine = read_description(options.resume).get("engine", "sb3")
+    if options.engine == "ray":
+        return run_with_ray(options)
+    return run(options)
+
+
+def run_with_ray(options: argparse.Namespace) -> int:
+    """Train as asked, once or with each of the seeds, on a Ray cluster; returns the exit status."""
+    try:
+        from agents.ray_engine import cluster
+    except ModuleNotFoundError as error:
+        fail(f"--engine ray needs Ray: pip install -e '.[train,ray]' ({error})")
+    here = os.cpu_count() or 1
+    needed = options.workers + 1 if options.seeds else options.workers
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(cluster(options.address, needed if options.address else max(needed, here)))
+        except (ConnectionError, ValueError) as error:
+            fail(f"--workers {options.workers} --address {options.address}: {error}")
+        return run_seeds(options) if options.seeds else run(options)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -69,14 +91,10 @@ def run(options: argparse.Namespace) -> int:
             fail(f"{source} holds a policy of {description['algo']!r}, not {algorithm!r}")
         algorithm = description["algo"]
         options.seed = description.get("seed", options.seed)
-    if options.resume:
-        options.engine = description.get("engine", "sb3")
     task = task or "reach"
     algorithm = algorithm or ("ppo" if options.engine == "ray" else DEFAULT_ALGORITHM[task])
     if algorithm not in HYPERPARAMETERS[task]:
         fail(f"--algo {algorithm}: not for the task {task!r}, whose algorithms are {', '.join(HYPERPARAMETERS[task])}")
-    if options.engine == "ray" and (algorithm != "ppo" or options.device != "cpu"):
-        fail(f"--engine ray trains ppo on the cpu, not {algorithm} on {options.device}")
     settings = dict(HYPERPARAMETERS[task][algorithm])
     import torch
 
@@ -121,6 +139,8 @@ def run_name(task: str, algorithm: str, engine: str, seed: int) -> str:
 
 def run_seeds(options: argparse.Namespace) -> int:
     """Train with each of the seeds, as many at a time as there are processors for; returns the exit status."""
+    from agents.ray_engine import run_trials
+
     task = options.task or "reach"
     parent = (options.out or Path("runs")).absolute()
 
@@ -130,7 +150,11 @@ def run_seeds(options: argparse.Namespace) -> int:
         report: dict[str, Any] = json.loads((folder / "report.json").read_text())
         return report["held_out"]["ppo"]
 
-    results = ray_engine().run_trials(trial, options.seeds, options.workers, options.address)
+    try:
+        results = run_trials(trial, options.seeds, options.workers)
+    except KeyboardInterrupt:
+        print(f"interrupted; runs that have begun go on with: python train.py --resume {parent}/...")
+        return 130
     for seed, result in zip(options.seeds, results, strict=True):
         print(f"seed {seed}: {Report(**result)}")
     return 0
@@ -179,6 +203,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         fail(f"--algo {options.algo}: unknown; the algorithms are {', '.join(ALGORITHMS)}")
     if options.engine not in ENGINES:
         fail(f"--engine {options.engine}: unknown; the engines are {', '.join(ENGINES)}")
+    if options.engine == "ray" and (options.algo not in (None, "ppo") or options.device != "cpu"):
+        fail(f"--engine ray trains ppo on the cpu, not {options.algo or 'ppo'} on {options.device}")
     if options.seeds and options.engine != "ray" and not options.benchmark:
         fail("--seeds needs --benchmark or --engine ray")
     for name in ("steps", "episodes", "threads", "jobs", "workers"):
@@ -223,17 +249,10 @@ def learner(algorithm: str, engine: str = "sb3") -> Any:
     from agents.dagger import DAgger
 
     if engine == "ray":
-        return ray_engine().RayPPO
+        from agents.ray_engine import RayPPO
+
+        return RayPPO
     return DAgger if algorithm == "dagger" else getattr(stable_baselines3, algorithm.upper())
-
-
-def ray_engine() -> Any:
-    """Return the module that trains with Ray; prints a message and exits with 2 if Ray is missing."""
-    try:
-        from agents import ray_engine
-    except ModuleNotFoundError as error:
-        fail(f"--engine ray needs Ray: pip install -e '.[train,ray]' ({error})")
-    return ray_engine
 
 
 def environments(settings: dict[str, Any], seed: int) -> Any:
@@ -255,7 +274,7 @@ def build(algorithm: str, settings: dict[str, Any], options: argparse.Namespace)
     """Return a fresh model."""
     made = for_learner(settings)
     if options.engine == "ray":
-        made |= {"env_id": settings["env"], "workers": options.workers, "address": options.address}
+        made |= {"env_id": settings["env"], "workers": options.workers}
     return learner(algorithm, options.engine)(
         env=environments(settings, options.seed), seed=options.seed, device=options.device, **made
     )
@@ -274,7 +293,7 @@ def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse
             fail(f"{path}: made for the {name} {getattr(model, name)}, but {settings['env']} has {getattr(env, name)}")
     model.set_env(env)
     if options.engine == "ray":
-        model.workers, model.address = options.workers, options.address
+        model.workers = options.workers
     return model
 
 

@@ -6,10 +6,10 @@ evaluating it needs no Ray.
 """
 
 import logging
-import os
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -158,9 +158,7 @@ class RayPPO(PPO):
     env_id : str
         Id of the environments that the workers make.
     workers : int
-        How many processes step environments.
-    address : str, optional
-        Of a running Ray cluster ("auto" for the one on this machine); a local one is started otherwise.
+        How many processes step environments; on the `cluster` that `learn` is called in, or on this machine.
 
     Raises
     ------
@@ -168,17 +166,15 @@ class RayPPO(PPO):
         For an option that RLlib's PPO does not have.
     """
 
-    def __init__(
-        self, policy: Any, env: Any, env_id: str = "", workers: int = 1, address: str | None = None, **options: Any
-    ) -> None:
+    def __init__(self, policy: Any, env: Any, env_id: str = "", workers: int = 1, **options: Any) -> None:
         super().__init__(policy, env, **options)
-        self.env_id, self.workers, self.address = env_id, workers, address
+        self.env_id, self.workers = env_id, workers
         for name, plain in (("clip_range_vf", None), ("target_kl", None), ("use_sde", False), ("normalize_advantage", True)):
             if getattr(self, name) != plain:
                 raise ValueError(f"{name} = {getattr(self, name)!r}: expected {plain!r}, RLlib's PPO has no other")
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "workers", "address"]  # where it ran is no part of what was learnt
+        return [*super()._excluded_save_params(), "workers"]  # where it ran is no part of what was learnt
 
     def config(self, steps: int) -> PPOConfig:
         """Return RLlib's form of the settings, for training of so many steps from where the model stands.
@@ -242,17 +238,13 @@ class RayPPO(PPO):
     ) -> "RayPPO":
         """Train until `total_timesteps` more steps are done; see `BaseAlgorithm.learn`."""
         total, callbacks = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        ours = connect(self.address, self.workers)
-        try:
+        with cluster(None, self.workers):
             algorithm = self.config(total - self.num_timesteps).build_algo()
             try:
                 self._iterate(algorithm, total, callbacks)
             finally:
                 algorithm.stop()
                 shutil.rmtree(algorithm.logdir, ignore_errors=True)
-        finally:
-            if ours:
-                ray.shutdown()
         return self
 
     def _iterate(self, algorithm: Any, total: int, callbacks: Any) -> None:
@@ -290,23 +282,44 @@ def optimizers(learner: Any) -> list[torch.optim.Optimizer]:
     return [optimizer for _, optimizer in learner.get_optimizers_for_module("default_policy")]
 
 
-def connect(address: str | None, processors: int) -> bool:
-    """Connect to a Ray cluster, or start a local one; returns whether that is new."""
+@contextmanager
+def cluster(address: str | None, processors: int) -> Iterator[None]:
+    """Be connected to a Ray cluster; to be used in a `with` statement. Within another one it does nothing.
+
+    Parameters
+    ----------
+    address : str, optional
+        Of a running cluster ("auto" for the one on this machine); by default one is started on this machine, and ended.
+    processors : int
+        How many will be needed.
+
+    Raises
+    ------
+    ConnectionError
+        If there is no cluster at the address.
+    ValueError
+        If the cluster has fewer processors: Ray would wait for more for ever.
+    """
     if ray.is_initialized():
-        return False
+        yield
+        return
     logging.getLogger("ray.rllib").setLevel(logging.ERROR)
     quiet: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
     if address is None:
         ray.init("local", num_cpus=processors, include_dashboard=False, object_store_memory=OBJECT_STORE_BYTES, **quiet)
     else:
-        ray.init(address=address, **quiet)
-    return True
+        ray.init(address, **quiet)
+    try:
+        found = int(ray.cluster_resources().get("CPU", 0))
+        if found < processors:
+            raise ValueError(f"processors = {processors}: expected at most {found}, all that the cluster has")
+        yield
+    finally:
+        ray.shutdown()
 
 
-def run_trials(
-    trial: Callable[[Any], dict[str, Any]], settings: Sequence[Any], workers: int, address: str | None
-) -> list[dict[str, Any]]:
-    """Run a trial with each of some settings by Ray Tune, as many at a time as the cluster has processors for.
+def run_trials(trial: Callable[[Any], dict[str, Any]], settings: Sequence[Any], workers: int) -> list[dict[str, Any]]:
+    """Run a trial with each of some settings by Ray Tune, within `cluster`: as many at a time as that has processors for.
 
     Parameters
     ----------
@@ -316,9 +329,7 @@ def run_trials(
     settings : sequence
         One for each trial.
     workers : int
-        How many workers a trial has.
-    address : str, optional
-        As of `RayPPO`.
+        How many a trial has.
 
     Returns
     -------
@@ -330,24 +341,21 @@ def run_trials(
     RuntimeError
         If a trial fails; the others are finished first.
     """
-    ours = connect(address, max(os.cpu_count() or 1, workers + 1))
-    try:
-        here = f"node:{ray.util.get_node_ip_address()}"
-        places = tune.PlacementGroupFactory([{"CPU": 1, here: 0.001}, *[{"CPU": 1}] * workers])
+    here = f"node:{ray.util.get_node_ip_address()}"
+    places = tune.PlacementGroupFactory([{"CPU": 1, here: 0.001}, *[{"CPU": 1}] * workers])
 
-        def go(config: dict[str, Any]) -> None:
-            tune.report({"outcome": trial(config["setting"])})
+    def go(config: dict[str, Any]) -> None:
+        tune.report({"outcome": trial(config["setting"])})
 
-        with tempfile.TemporaryDirectory() as scratch:
-            results = tune.Tuner(
-                tune.with_resources(go, places),
-                param_space={"setting": tune.grid_search(list(settings))},
-                run_config=tune.RunConfig(storage_path=scratch, verbose=0),
-            ).fit()
-        for result in results:
-            if result.error is not None:
-                raise RuntimeError(f"the trial with {result.config['setting']} failed") from result.error
-        return [result.metrics["outcome"] for result in results]
-    finally:
-        if ours:
-            ray.shutdown()
+    with tempfile.TemporaryDirectory() as scratch:
+        results = tune.Tuner(
+            tune.with_resources(go, places),
+            param_space={"setting": tune.grid_search(list(settings))},
+            run_config=tune.RunConfig(storage_path=scratch, verbose=0),
+        ).fit()
+    for result in results:
+        if result.error is not None:
+            raise RuntimeError(f"the trial with {result.config['setting']} failed") from result.error
+        if "outcome" not in (result.metrics or {}):  # Tune stops, but says nothing, when Ctrl-C is pressed
+            raise KeyboardInterrupt
+    return [result.metrics["outcome"] for result in results]

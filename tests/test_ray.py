@@ -27,8 +27,7 @@ with warnings.catch_warnings():
     ray = pytest.importorskip("ray", reason="needs the extra ray: pip install -e '.[train,ray]'")
     from ray.cluster_utils import Cluster
 
-    from agents import ray_engine
-    from agents.ray_engine import BatchRunner, RayPPO, cut
+    from agents.ray_engine import BatchRunner, RayPPO, cluster, cut, run_trials
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning:ray"),
@@ -58,13 +57,13 @@ def quiet():
 
 @pytest.fixture(scope="module")
 def address():
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "object_store_memory": STORE})
-    cluster.add_node(num_cpus=1, object_store_memory=STORE)
-    yield cluster.address
-    cluster.shutdown()
+    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "object_store_memory": STORE})
+    nodes.add_node(num_cpus=1, object_store_memory=STORE)
+    yield nodes.address
+    nodes.shutdown()
 
 
-def model(address, **options):
+def model(**options):
     settings = {
         "n_steps": 64,
         "batch_size": 1024,
@@ -74,7 +73,7 @@ def model(address, **options):
         "learning_rate": 1e-3,
         "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -0.5},
     }
-    return RayPPO("MultiInputPolicy", make(ID, 64, 0), env_id=ID, workers=2, address=address, seed=0, **settings | options)
+    return RayPPO("MultiInputPolicy", make(ID, 64, 0), env_id=ID, workers=2, seed=0, **settings | options)
 
 
 def test_a_record_is_cut_where_episodes_end():
@@ -100,14 +99,11 @@ def test_a_record_is_cut_where_episodes_end():
 
 def test_a_worker_steps_what_the_single_environment_steps(address):
     """Two samples of 60 steps: the episode of 100 goes on in the second, ends and another one begins."""
-    ray.init(address=address, log_to_driver=False)
-    try:
-        runner = BatchRunner(config=model(address).config(1000), worker_index=1)
+    with cluster(address, 2):
+        runner = BatchRunner(config=model().config(1000), worker_index=1)
         lanes = runner.num_envs
         first, second = (runner.sample(num_timesteps=60 * lanes) for _ in range(2))
         metrics = runner.get_metrics()
-    finally:
-        ray.shutdown()
     assert len(first) == lanes and len(second) == 2 * lanes
     lane = 5
     env = gym.make(ID)
@@ -160,11 +156,12 @@ def test_two_workers_learn_and_one_that_dies_is_replaced(address, monkeypatch, t
         iterate(self, algorithm, total, callbacks)
 
     monkeypatch.setattr(RayPPO, "_iterate", noted)
-    learner = model(address)
+    learner = model()
     env = gym.make_vec(ID, 30)
     before = evaluate(learner, env, 30)
     callback = Stop(algorithms, 30_000)
-    learner.learn(60_000, callback=callback)
+    with cluster(address, 2):
+        learner.learn(60_000, callback=callback)
     assert callback.free == 0  # both nodes' only processor is taken
     assert 60_000 <= learner.num_timesteps < 60_000 + 2 * 64 * 64
     assert not ray.is_initialized()
@@ -173,14 +170,13 @@ def test_two_workers_learn_and_one_that_dies_is_replaced(address, monkeypatch, t
     learner.save(tmp_path / "policy.zip")
     plain = PPO.load(tmp_path / "policy.zip")
     assert evaluate(plain, env, 30) == after
-    assert not hasattr(plain, "address") and not hasattr(plain, "workers")
     state = plain.policy.optimizer.state_dict()["state"]
     assert state[0]["step"] > 100 and state[0]["exp_avg"].abs().max() > 0.0  # so that going on is going on
 
 
-def test_settings_become_rllibs(address):
+def test_settings_become_rllibs():
     rate = {"learning_rate": lambda left: 1e-3 * left}
-    learner = model(address, ent_coef=0.01, clip_range=0.1, vf_coef=0.7, max_grad_norm=0.3, **rate)
+    learner = model(ent_coef=0.01, clip_range=0.1, vf_coef=0.7, max_grad_norm=0.3, **rate)
     learner.num_timesteps = 1000
     config = learner.config(3000)
     assert config.lr[0] == [0, pytest.approx(0.75e-3)] and config.lr[-1] == [3000, pytest.approx(0.0)]
@@ -188,9 +184,9 @@ def test_settings_become_rllibs(address):
     assert (config.entropy_coeff, config.clip_param, config.vf_loss_coeff, config.grad_clip) == (0.01, 0.1, 0.7, 0.3)
     assert config.train_batch_size_per_learner == 64 * 64
     assert (config.num_env_runners, config.num_envs_per_env_runner, config.seed) == (2, 32, 0)
-    assert model(address).config(3000).lr == 1e-3
+    assert model().config(3000).lr == 1e-3
     with pytest.raises(ValueError, match=r"clip_range = .*: expected a constant"):
-        model(address, clip_range=lambda left: 0.2 * left).config(3000)
+        model(clip_range=lambda left: 0.2 * left).config(3000)
 
 
 @pytest.mark.parametrize(
@@ -198,7 +194,7 @@ def test_settings_become_rllibs(address):
 )
 def test_what_rllib_has_not_is_refused(name, value):
     with pytest.raises(ValueError, match=f"{name} = .*: expected"):
-        model(None, **{name: value})
+        model(**{name: value})
 
 
 def run(*arguments, **options):
@@ -253,7 +249,27 @@ def test_a_failed_trial_is_told(address):
             raise ValueError("no good")
         return {"setting": setting}
 
-    assert ray_engine.run_trials(trial, [0, 2], 0, address) == [{"setting": 0}, {"setting": 2}]
-    with pytest.raises(RuntimeError, match="the trial with 1 failed"):
-        ray_engine.run_trials(trial, [0, 1], 0, address)
+    with cluster(address, 1):
+        assert run_trials(trial, [0, 2], 0) == [{"setting": 0}, {"setting": 2}]
+        with pytest.raises(RuntimeError, match="the trial with 1 failed"):
+            run_trials(trial, [0, 1], 0)
+    assert not ray.is_initialized()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--workers", "3"], "processors = 3: expected at most 2"),
+        (["--workers", "2", "--seeds", "0", "1"], "processors = 3: expected at most 2"),
+        (["--address", "127.0.0.1:1"], "--address 127.0.0.1:1: "),
+    ],
+)
+def test_a_cluster_that_is_too_small_or_not_there_is_told(arguments, message, address, tmp_path, capsys):
+    policy = tmp_path / "policy.zip"
+    policy.write_text("of an earlier run")
+    with pytest.raises(SystemExit) as stop:
+        train.main(["--engine", "ray", "--address", address, "--out", str(tmp_path), *arguments])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+    assert policy.read_text() == "of an earlier run"
     assert not ray.is_initialized()
