@@ -72,7 +72,7 @@ def run_with_ray(options: argparse.Namespace) -> int:
         try:
             stack.enter_context(cluster(options.address, needed if options.address else max(needed, here)))
         except (ConnectionError, ValueError) as error:
-            fail(f"--workers {options.workers} --address {options.address}: {error}")
+            fail(f"--engine ray: {error}")
         return run_seeds(options) if options.seeds else run(options)
 
 

@@ -7,6 +7,7 @@ evaluating it needs no Ray.
 
 import logging
 import shutil
+import socket
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -289,7 +290,8 @@ def cluster(address: str | None, processors: int) -> Iterator[None]:
     Parameters
     ----------
     address : str, optional
-        Of a running cluster ("auto" for the one on this machine); by default one is started on this machine, and ended.
+        HOST:PORT of a running cluster ("auto" for the one that this machine is part of); by default one is started on this
+        machine, and ended.
     processors : int
         How many will be needed.
 
@@ -303,6 +305,12 @@ def cluster(address: str | None, processors: int) -> Iterator[None]:
     if ray.is_initialized():
         yield
         return
+    if address not in (None, "auto"):
+        host, _, port = address.rpartition(":")
+        try:
+            socket.create_connection((host, int(port)), timeout=10).close()  # Ray itself would try for many minutes
+        except (OSError, ValueError) as error:
+            raise ConnectionError(f"address = {address!r}: expected HOST:PORT of a Ray cluster, or 'auto' ({error})") from None
     logging.getLogger("ray.rllib").setLevel(logging.ERROR)
     quiet: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
     if address is None:

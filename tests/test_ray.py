@@ -261,7 +261,8 @@ def test_a_failed_trial_is_told(address):
     [
         (["--workers", "3"], "processors = 3: expected at most 2"),
         (["--workers", "2", "--seeds", "0", "1"], "processors = 3: expected at most 2"),
-        (["--address", "127.0.0.1:1"], "--address 127.0.0.1:1: "),
+        (["--address", "127.0.0.1:1"], "address = '127.0.0.1:1': expected HOST:PORT of a Ray cluster, or 'auto'"),
+        (["--address", "there"], "address = 'there': expected HOST:PORT of a Ray cluster, or 'auto'"),
     ],
 )
 def test_a_cluster_that_is_too_small_or_not_there_is_told(arguments, message, address, tmp_path, capsys):
