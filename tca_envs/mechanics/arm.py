@@ -25,7 +25,8 @@ from tca_envs.mechanics.collocation import (
     SUBSTEPS,
     WARM,
     Model,
-    compile_kernels,
+    addresses,
+    flat,
     linearise,
     solve_lanes,
 )
@@ -448,7 +449,7 @@ class Arm:
         asked = (drive[np.newaxis], load[np.newaxis])
         on, message = self, ""
         if not (self.unstressed(load) and self._closed_form(lane, *asked, tip, lengths, report)):
-            compile_kernels()
+            addresses()
             begun = time.perf_counter()
             strain, tension, from_drive, from_load = lane
             solve_lanes(
@@ -700,7 +701,7 @@ def _compile(modules: tuple[Module, ...], grids: tuple[Grid, ...], tolerance: fl
         arc.append(base + module.length * x)
         base += module.length
     muscles = [(module, muscle) for module in modules for muscle in module.muscles]
-    model = Model(
+    fields = dict(
         elements=np.array([grid.elements for grid in grids], dtype=np.int64),
         nodes=np.array([grid.nodes for grid in grids], dtype=np.int64),
         length=np.array([module.length for module in modules]),
@@ -715,6 +716,6 @@ def _compile(modules: tuple[Module, ...], grids: tuple[Grid, ...], tolerance: fl
         parameters=np.array([muscle.law.parameters() for _, muscle in muscles]).reshape(-1, PARAMETERS),
         rest_length=np.array([module.rest_length(muscle) for module, muscle in muscles]),
         tolerance=tolerance,
-        ladder=True,
     )
-    return model, np.concatenate(arc)
+    f, i = flat(**fields)
+    return Model(**fields, ladder=True, f=f, i=i), np.concatenate(arc)

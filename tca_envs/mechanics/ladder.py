@@ -26,7 +26,7 @@ from tca_envs.mechanics.collocation import (
     SUBSTEPS,
     WARM,
     Model,
-    compile_kernels,
+    addresses,
     linearise,
     solve_lanes,
 )
@@ -208,7 +208,7 @@ def solve(
     Arguments as of `collocation.solve_lanes`; lanes without an answer are left as they were. An answer on a finer grid is
     carried to the arm's own.
     """
-    compile_kernels()
+    addresses()
     start = (strain.copy(), tension.copy(), from_drive.copy(), from_load.copy())
     lanes = (strain, tension, from_drive, from_load)
     solve_lanes(arm.model, *lanes, drive, load, tip, lengths, report)
