@@ -28,6 +28,8 @@ parallel = njit(parallel=True, **OPTIONS)
 """Decorator of kernels that Python calls and that share their work among threads."""
 inner = njit(**INNER)
 """Decorator of kernels that only kernels call: without wrappers they compile faster."""
+merged = njit(inline="always", **INNER)
+"""Decorator of kernels that one kernel calls: they become part of it before anything is compiled."""
 _small = njit(forceinline=True, **INNER)
 
 

@@ -33,6 +33,7 @@ from tca_envs.mechanics.algebra import (
     cross,
     dot,
     inner,
+    merged,
     inverse,
     matmul,
     outer,
@@ -219,7 +220,7 @@ def negatives(a):
     return choose(size(det), np.inf, first + size(first - second) + size(second - third), 3.0)
 
 
-@inner
+@merged
 def _turn(f, i, w, e, g0, k, q, h, guessed):
     """Collocate the quaternion over element e, eq. (28); return 1 where the nodes can resolve the rotation, else 0.
 
@@ -397,7 +398,7 @@ def evaluate(f, i, a, w, guessed, __):
     w[i[TOTAL]] = choose(0.5, good, total, np.inf)
 
 
-@inner
+@merged
 def _section(f, i, w, k, g, j, damping):
     """Linearise the section at node g: H = K + sum_i F_i d[r x t; t]/dxi, dv eliminated; return H_vv's negative eigenvalues.
 
@@ -599,7 +600,7 @@ def eliminate(f, i, a, w, _, damping):
     w[i[INDEX]] = index
 
 
-@inner
+@merged
 def _factorise_blocks(i, w, inside, g0, q, mk):
     """LU without pivoting, in 3 x 3 blocks, of an element's matrix; PHI (if `inside`) and PULLED become the solutions.
 
@@ -641,7 +642,7 @@ def _factorise_blocks(i, w, inside, g0, q, mk):
     return negative
 
 
-@inner
+@merged
 def _factorise(w, matrix, order, stride):
     """LU without pivoting of a matrix, in place, the diagonal of U inverted; returns how many pivots are positive."""
     positive = spread(0.0)
@@ -658,7 +659,7 @@ def _factorise(w, matrix, order, stride):
     return positive
 
 
-@inner
+@merged
 def _solve(w, matrix, order, stride, x):
     """Solve with the factors of `_factorise` for the packs from `x` on, in place."""
     for r in range(order):
@@ -852,7 +853,7 @@ def newton(f, i, a, w, _, __):
     w[i[CONVERGED]], w[i[ITERATIONS]], w[i[FIRST_STEP]] = converged, iterations, first
 
 
-@inner
+@merged
 def _copy(w, source, target, count):
     for k in range(count):
         w[target + k] = w[source + k]
@@ -919,7 +920,7 @@ def _store(x, target, y, at, count, lane):
         x[target + k] = y[(at + k) * PACK + lane]
 
 
-@inner
+@merged
 def _tell(i, a, w, place, row):
     """Write the state of place `place` of the packs to row `row` of the lanes: an answer."""
     nodes, muscles = i[NODES], i[MUSCLES]
