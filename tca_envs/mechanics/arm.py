@@ -462,7 +462,7 @@ class Arm:
                 message, on, lane = climbed.message, climbed.arm, climbed.lane
                 tip[0], lengths[0], iterations = climbed.tip, climbed.lengths, report[0, 2] + climbed.iterations
                 report[0, :4] = climbed.rung, climbed.residual, iterations, climbed.jumped
-            elif report[0, 0] == SUBSTEPS or report[0, 4] > ladder.LONG:
+            elif report[0, 0] == SUBSTEPS or report[0, 4] > ladder.DOUBT:
                 here = self.unloaded() if start is None else self.restart(start)
                 report[0, 3] = not ladder.returns(self.model, lane, here, begun + time_limit_s)
         rung, residual, iterations, jumped, _ = report[0].tolist()

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from tca_envs.mechanics import kernels
 from tca_envs.mechanics.algebra import CALLED, apply, dot, entry, inner, parallel, rotation_matrix
 from tca_envs.mechanics.kernels import (
-    AT_STRAIN, BUDGET, CLOSED_FORM, COUNT, DESCENT, FAILED, FINER, LANES, LOAD, MAX_ITERATIONS, NEUTRAL, PAYLOAD_MASS, REPORT,
-    SMALLEST_SUBSTEP, SUBSTEPS, WARM,
+    AT_ACTION, AT_HEATING, AT_POWER, AT_STRAIN, AT_TEMPERATURE, BUDGET, CLOSED_FORM, COUNT, DESCENT, FAILED, FINER, HEAT, HEATED,
+    JOB, LANES, LOAD, MAX_ITERATIONS, NEUTRAL, PAYLOAD_MASS, REPORT, SMALLEST_SUBSTEP, SUBSTEPS, WARM,
 )  # fmt: skip
 from tca_envs.mechanics.muscle import PARAMETERS, TENDON, elongation, pull, stored
 from tca_envs.mechanics.packs import (
@@ -66,6 +66,18 @@ def flat(elements, nodes, length, a, b, stiffness, reference, first_muscle, rout
     return numbers, np.concatenate([sizes, in_i, in_f, in_w, *integers]).astype(np.int64)
 
 
+class Heat(NamedTuple):
+    """How drives come about that are temperatures of heated TCAs: by one step of `thermal.step`."""
+
+    action: Array  # (N, m) heating powers asked for, -1 (none) to 1 (full)
+    temperature: Array  # (N, m) at the start of the step [degC]
+    power: Array  # (N, m) out: heating powers [W]
+    constants: Array  # (6, m) share of heat kept in a step, share lost, loss [W/K], full power [W], ambient and limit [degC]
+
+
+NO_HEAT = Heat(*np.empty((4, 0, 0)))
+
+
 class _Scratch(threading.local):
     """Packs for the kernels to work on; each thread of Python has its own."""
 
@@ -85,7 +97,7 @@ class _Scratch(threading.local):
 _scratch = _Scratch()
 
 
-def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, first=1.0, threads=1):
+def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, first=1.0, threads=1, heat=None):
     """Follow the branches of N arms of one model, each from its own known equilibrium.
 
     Parameters
@@ -96,22 +108,25 @@ def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip,
         In: known equilibria. Out: the asked ones; where there was none, the last ones on the way.
     from_drive, from_load : (N, n), (N, LOAD) arrays
         In: where (strain, tension) are in equilibrium. Out: where they are now: as asked, or as far as the branch went.
-    drive, load : (N, n), (N, LOAD) arrays
-        What is asked.
+    drive, load : (N, n or more), (N, LOAD) arrays
+        What is asked; a lane's first n drives are the arm's.
     tip : (N, 4, 4) array
         Out: tip poses [m], but for the last row, which stays; unchanged where there was no answer.
     lengths : (N, n) array
         Out: path lengths [m]; unchanged where there was no answer.
     report : (N, REPORT) array
         Out: rung (WARM, SUBSTEPS or FAILED), dimensionless residual, Newton iterations, jumped (0; of a lane that FAILED, the
-        substep to go on with), largest first step of a Newton (rotation [rad] and stretch). A lane that FAILED is at the end of
+        substep to go on with), by how much Newton's steps shrank at worst (0 where
+        the first was not LONG). A lane that FAILED is at the end of
         its branch (the substep is below SMALLEST_SUBSTEP) or has done `budget` iterations.
     first : float
         Substep to begin with, as a share of the way: 1 but for a lane that goes on.
     threads : int
         How many share the work; no number depends on it.
+    heat : Heat, optional
+        How `drive` comes about; it is overwritten then. Lanes must be at equilibria found before.
     """
-    arrays = (strain, tension, from_drive, from_load, drive, load, tip, lengths, report)
+    arrays = (strain, tension, from_drive, from_load, drive, load, tip, lengths, report, *(NO_HEAT if heat is None else heat))
     steps = budget(model) if model.ladder else 0
     if threads > 1 and len(strain) > PACK:
         before = get_num_threads()
@@ -130,7 +145,9 @@ def budget(model):
 @cache
 def addresses() -> NDArray[np.int64]:
     """Return the addresses of the kernels; compiles them, or loads them from the cache, which is no part of the time of a solve."""
-    made = (kernels.evaluate, kernels.eliminate, kernels.substitute, kernels.newton, kernels.follow, kernels.lanes)
+    made = (
+        kernels.evaluate, kernels.eliminate, kernels.substitute, kernels.newton, kernels.follow, kernels.heat, kernels.lanes,
+    )  # fmt: skip
     compiled = [cfunc(KERNEL, **CALLED)(kernel) for kernel in made]
     _KEPT.extend(compiled)
     return np.array([kernel.address for kernel in compiled], dtype=np.int64)
@@ -141,38 +158,56 @@ _KEPT: list = []
 
 
 @entry
-def _job(addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report):
+def _job(
+    addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action, temperature, power,
+    constants,
+):  # fmt: skip
     """Return what kernels find in `a`."""
-    job = np.empty(BUDGET + 1, dtype=np.int64)
+    job = np.empty(JOB, dtype=np.int64)
     for k in range(AT_STRAIN):
         job[k] = addresses[k]
     job[AT_STRAIN], job[AT_STRAIN + 1] = address_of(strain), address_of(tension)
     job[AT_STRAIN + 2], job[AT_STRAIN + 3] = address_of(from_drive), address_of(from_load)
     job[AT_STRAIN + 4], job[AT_STRAIN + 5] = address_of(drive), address_of(load)
     job[AT_STRAIN + 6], job[AT_STRAIN + 7], job[AT_STRAIN + 8] = address_of(tip), address_of(lengths), address_of(report)
-    job[COUNT], job[BUDGET] = len(strain), budget
+    job[AT_ACTION], job[AT_TEMPERATURE] = address_of(action) if len(action) else 0, address_of(temperature)
+    job[AT_POWER], job[AT_HEATING] = address_of(power), address_of(constants)
+    job[COUNT], job[BUDGET], job[HEATED] = len(strain), budget, drive.shape[1]
     return job
+
+
+@inner
+def _solve_pack(f, i, job, w, n, first):
+    ff, ii, a = pointer_to_floats(f), pointer_to_ints(i), pointer_to_ints(job)
+    if job[AT_ACTION] != 0:
+        call_kernel(job[HEAT], ff, ii, a, w, n, 0.0)
+    call_kernel(job[LANES], ff, ii, a, w, n, first)
 
 
 @entry
 def _solve_serially(
-    f, i, addresses, w, budget, first, strain, tension, from_drive, from_load, drive, load, tip, lengths, report
+    f, i, addresses, w, budget, first, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action,
+    temperature, power, constants,
 ):  # fmt: skip
-    job = _job(addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report)
+    job = _job(
+        addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action, temperature, power,
+        constants,
+    )  # fmt: skip
     for n in range((len(strain) + PACK - 1) // PACK):
-        call_kernel(
-            job[LANES], pointer_to_floats(f), pointer_to_ints(i), pointer_to_ints(job), pointer_to_packs(w), n, first
-        )
+        _solve_pack(f, i, job, pointer_to_packs(w), n, first)
 
 
 @parallel
 def _solve_in_parallel(
-    f, i, addresses, w, budget, first, strain, tension, from_drive, from_load, drive, load, tip, lengths, report
+    f, i, addresses, w, budget, first, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action,
+    temperature, power, constants,
 ):  # fmt: skip
-    job = _job(addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report)
+    job = _job(
+        addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action, temperature, power,
+        constants,
+    )  # fmt: skip
     for n in prange((len(strain) + PACK - 1) // PACK):
-        mine = pointer_to_packs(w[get_thread_id()])
-        call_kernel(job[LANES], pointer_to_floats(f), pointer_to_ints(i), pointer_to_ints(job), mine, n, first)
+        _solve_pack(f, i, job, pointer_to_packs(w[get_thread_id()]), n, first)
 
 
 def linearise(model, strain, tension, drive, load, damping, slaved, ask, given):

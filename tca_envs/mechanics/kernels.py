@@ -66,6 +66,8 @@ MAX_ITERATIONS = 12
 MAX_ROTATION_STEP = 1.0  # rad
 MAX_SHEAR_STEP = 0.5
 CONTRACTION = 0.5
+LONG = 0.1
+"""Newton's first step, rotation [rad] and stretch, is long enough for another branch to be in reach."""
 ROUND_OFF = 1e-8
 """A step that is shorter need not contract."""
 NEUTRAL = 1e-5
@@ -91,7 +93,7 @@ REPORT = 5
     TOLERANCE, LENGTH, A, B, COUPLING, STIFFNESS, REFERENCE, ROUTE, MASS_BELOW, LAW, REST,
     STRAIN, TENSION, DRIVE, LOADS, KNOWN_STRAIN, KNOWN_TENSION, KNOWN_DRIVE, KNOWN_LOADS,
     GOOD_STRAIN, GOOD_TENSION, FROM_DRIVE, FROM_LOADS, TO_DRIVE, TO_LOADS,
-    ACTIVE, MOVED, CONVERGED, WORST, TOTAL, INDEX, ROTATED, SHEARED, ITERATIONS, FIRST_STEP, OUTCOME,
+    ACTIVE, MOVED, CONVERGED, WORST, TOTAL, INDEX, ROTATED, SHEARED, ITERATIONS, SLOWNESS, OUTCOME,
     RATE, QUATERNION, ENDS, POSITION, ROTATION, TANGENT, FORCE, MOMENT, SPIN, PATH, RESIDUAL, PATHS, GAP, SOFTNESS,
     COMPLIANCE, SLIDE, WRENCH, M_BLOCK, N_BLOCK, X_BLOCK, Y_BLOCK, PULL, SWING,
     MATRIX, PHI, PULLED, BASE, STRETCH, HANDED, BETA, MUSCLE_MATRIX, MUSCLE_PHI, MUSCLE_MOMENT,
@@ -102,11 +104,15 @@ muscles m of a module. The next four are where its integers begin in `i` itself:
 first muscles, n kinds. Then, where its numbers begin in `f`, see `tables`; and, from STRAIN on, where arrays begin among
 the packs, see `layout`. END is the number of packs in all."""
 (
-    EVALUATE, ELIMINATE, SUBSTITUTE, NEWTON, FOLLOW, LANES,
-    AT_STRAIN, AT_TENSION, AT_FROM_DRIVE, AT_FROM_LOAD, AT_DRIVE, AT_LOAD, AT_TIP, AT_LENGTHS, AT_REPORT, COUNT, BUDGET,
-) = range(17)  # fmt: skip
-"""Places in `a`: kernels, then the arrays of `collocation.solve_lanes`, how many lanes they have and how many iterations a lane
-may take."""
+    EVALUATE, ELIMINATE, SUBSTITUTE, NEWTON, FOLLOW, HEAT, LANES,
+    AT_STRAIN, AT_TENSION, AT_FROM_DRIVE, AT_FROM_LOAD, AT_DRIVE, AT_LOAD, AT_TIP, AT_LENGTHS, AT_REPORT,
+    AT_ACTION, AT_TEMPERATURE, AT_POWER, AT_HEATING, COUNT, BUDGET, HEATED, JOB,
+) = range(24)  # fmt: skip
+"""Places in `a`: kernels, then the arrays of `collocation.solve_lanes` and of `collocation.Heat`, how many lanes they have, how many
+iterations a lane may take, and how many drives a lane has: TCAs, where they are heated, that are not the arm's come after those
+that are. JOB is the number of places."""
+KEPT_SHARE, LOST_SHARE, LOSS, MAX_POWER, AMBIENT_AT, LIMIT_AT = range(6)
+"""Rows of the array at AT_HEATING (6, HEATED)."""
 
 
 def layout(modules: int, n: int, nodes: int, elements: int, wide: int, most: int) -> tuple[int, ...]:
@@ -780,26 +786,29 @@ def substitute(f, i, a, w, _, __):
     w[i[SHEARED]] = choose(size(dot(dp, dp)), np.inf, root(sheared), np.inf)
 
 
-def newton(f, i, a, w, _, __):
+def newton(f, i, a, w, certified, __):
     """Solve by Newton from the state at STRAIN, in place, each arm on the branch of equilibria that it is near.
 
     Newton must go straight to the answer. It gives up where a step turns a section by more than MAX_ROTATION_STEP; where a step
     is not CONTRACTION times shorter than the one before; or if it takes long. For a solve that has to be steered may end on
     another branch. One that contracts finds the only equilibrium nearby (the theorem of Newton and Kantorovich in affine
-    covariant form; Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 5.1); that this is on the branch that the
-    start is on is seen by going back, `ladder.returns`, where the way is long. What has MOVED, drive or load, takes a step
+    covariant form; Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 5.1). Where steps shrink to less than a quarter
+    that holds for all the way from the start, so the answer is on the start's branch; where they do not, going back tells,
+    `ladder.returns`. What has MOVED, drive or load, takes a step
     even where the start would do: a small change moves the arm a little, not in jerks.
 
-    The answer must be stable by the count of `eliminate` there. Factors of an earlier step would not do, however well they
+    The answer must be stable by the count of `eliminate` there; a start that is the answer, if it is not `certified` already. Factors of an earlier step would not do, however well they
     serve for steps: the smallest eigenvalue changes by as much as the arm turns.
 
     The tangent is factorised for every KEPT-th step of all arms. In between a step with old factors gains almost as much as
     one with new ones, at a third of the cost; an arm for which it would not waits. An arm that is done, or lost, keeps its
-    state. So what an arm does depends on itself alone. CONVERGED, WORST, ITERATIONS and the size of the FIRST_STEP tell the end.
+    state. So what an arm does depends on itself alone. CONVERGED, WORST and ITERATIONS tell the end, and SLOWNESS the largest
+    ratio of a step to the one before, 0 where the first was not LONG.
     """
     nodes, muscles = i[NODES], i[MUSCLES]
     moved = w[i[MOVED]]
     worst = extent = spread(np.inf)
+    slowness = spread(0.0)
     iterations, first, converged, active = spread(0.0), spread(0.0), spread(0.0), spread(1.0)
     for turn in range(KEPT * MAX_ITERATIONS):
         w[i[ACTIVE]] = active
@@ -826,6 +835,7 @@ def newton(f, i, a, w, _, __):
         active = active - going * (1.0 - good)
         first = choose(0.5, iterations, first, choose(0.5, going, step, first))
         going = going * good
+        slowness = largest(slowness, choose(0.5, going, choose(last, np.inf, step / last, 0.0), 0.0))
         extent = choose(0.5, going, step, last)
         iterations = iterations + going
         for g in range(nodes):
@@ -847,10 +857,11 @@ def newton(f, i, a, w, _, __):
         for muscle in range(muscles):
             at = i[TENSION] + muscle
             w[at] = choose(0.5, going, w[at] + w[i[CHANGE] + muscle], w[at])
-    if any_of(converged):
+    counted = choose(0.5, iterations, 1.0, 1.0 - certified)
+    if any_of(converged * counted):
         call_kernel(a[ELIMINATE], f, i, a, w, 0, NEUTRAL)
-        converged = choose(w[i[INDEX]], 0.5, converged, 0.0)
-    w[i[CONVERGED]], w[i[ITERATIONS]], w[i[FIRST_STEP]] = converged, iterations, first
+        converged = choose(counted * w[i[INDEX]], 0.5, converged, 0.0)
+    w[i[CONVERGED]], w[i[ITERATIONS]], w[i[SLOWNESS]] = converged, iterations, choose(LONG, first, slowness, 0.0)
 
 
 @merged
@@ -865,7 +876,7 @@ def follow(f, i, a, w, budget, first):
     Newton over `first`, a share of the way, to begin with; its first step is the tangent's prediction. Where it fails, in
     substeps, shortened on failure and doubled on success, for at most `budget` iterations. In: the equilibrium where the way begins, at
     STRAIN. Out: that where it ends; FROM_DRIVE and FROM_LOADS, where that is; OUTCOME: rung (SUBSTEPS or FAILED),
-    residual, Newton iterations in all, next substep as a share of what is left of the way, largest first step of Newton.
+    residual, Newton iterations in all, next substep as a share of what is left of the way, largest SLOWNESS.
     """
     strains, muscles = 6 * i[NODES], i[MUSCLES]
     way = muscles + LOAD
@@ -876,7 +887,7 @@ def follow(f, i, a, w, budget, first):
         if part(w[start + k], 0) != part(w[goal + k], 0):
             moved = 1.0
     w[i[MOVED]] = spread(moved)
-    longest, spent, work, done, step, rung = 0.0, 0.0, 0.0, 0.0, first, SUBSTEPS
+    slowest, spent, work, done, step, rung = 0.0, 0.0, 0.0, 0.0, first, SUBSTEPS
     while True:
         here = min(1.0, done + step)
         share = (here - done) / (1.0 - done)
@@ -887,7 +898,7 @@ def follow(f, i, a, w, budget, first):
         spent += iterations
         work += iterations + 1.0
         if part(w[i[CONVERGED]], 0) > 0.5:
-            longest = max(longest, part(w[i[FIRST_STEP]], 0))
+            slowest = max(slowest, part(w[i[SLOWNESS]], 0))
             _copy(w, i[DRIVE], start, way)
             if here == 1.0:
                 step = 1.0
@@ -903,7 +914,7 @@ def follow(f, i, a, w, budget, first):
             break
     outcome = i[OUTCOME]
     w[outcome], w[outcome + 1], w[outcome + 2] = spread(float(rung)), spread(worst), spread(spent)
-    w[outcome + 3], w[outcome + 4] = spread(step), spread(longest)
+    w[outcome + 3], w[outcome + 4] = spread(step), spread(slowest)
 
 
 @inner
@@ -941,9 +952,29 @@ def _tell(i, a, w, place, row):
     tip[at + 8], tip[at + 9], tip[at + 10] = part(r[6], place), part(r[7], place), part(r[8], place)
 
 
+def heat(f, i, a, w, n, _):
+    """Heat the TCAs of the lanes of pack `n` for one step: `thermal.step` at the powers asked for, under the cut-off.
+
+    Writes the powers [W], and to the drives the temperatures [degC] that come of them.
+    """
+    heated = a[HEATED]
+    action, temperature, power = floats_at(a[AT_ACTION]), floats_at(a[AT_TEMPERATURE]), floats_at(a[AT_POWER])
+    constants, drive = floats_at(a[AT_HEATING]), floats_at(a[AT_DRIVE])
+    for row in range(n * PACK, min(n * PACK + PACK, a[COUNT])):
+        for k in range(heated):
+            at = row * heated + k
+            kept, loss, ambient = constants[KEPT_SHARE * heated + k], constants[LOSS * heated + k], constants[AMBIENT_AT * heated + k]
+            asked = 0.5 * (min(max(action[at], -1.0), 1.0) + 1.0) * constants[MAX_POWER * heated + k]
+            end = (constants[LIMIT_AT * heated + k] - kept * temperature[at]) / constants[LOST_SHARE * heated + k]
+            given = min(asked, max(loss * (end - ambient), 0.0))
+            end = ambient + given / loss
+            power[at] = given
+            drive[at] = end + (temperature[at] - end) * kept
+
+
 def lanes(f, i, a, w, n, first):
     """Solve the lanes of pack `n` of the arrays of `collocation.solve_lanes`, those of a pack at a time, and stragglers alone."""
-    strains, muscles, count = 6 * i[NODES], i[MUSCLES], a[COUNT]
+    strains, muscles, count, drives = 6 * i[NODES], i[MUSCLES], a[COUNT], a[HEATED]
     y = floats_of(w)
     strain, tension, report = floats_at(a[AT_STRAIN]), floats_at(a[AT_TENSION]), floats_at(a[AT_REPORT])
     from_drive, from_load = floats_at(a[AT_FROM_DRIVE]), floats_at(a[AT_FROM_LOAD])
@@ -952,11 +983,11 @@ def lanes(f, i, a, w, n, first):
         row = min(n * PACK + place, count - 1)  # fill up with copies of the last
         _load(strain, strains * row, y, i[STRAIN], strains, place)
         _load(tension, muscles * row, y, i[TENSION], muscles, place)
-        _load(drive, muscles * row, y, i[DRIVE], muscles, place)
+        _load(drive, drives * row, y, i[DRIVE], muscles, place)
         _load(load, LOAD * row, y, i[LOADS], LOAD, place)
         moved = 0.0
         for k in range(muscles):
-            if drive[muscles * row + k] != from_drive[muscles * row + k]:
+            if drive[drives * row + k] != from_drive[muscles * row + k]:
                 moved = 1.0
         for k in range(LOAD):
             if load[LOAD * row + k] != from_load[LOAD * row + k]:
@@ -965,12 +996,13 @@ def lanes(f, i, a, w, n, first):
     lost = 0
     rows = min(PACK, count - n * PACK)
     if first == 1.0:
-        call_kernel(a[NEWTON], f, i, a, w, 0, 0.0)
+        # What is heated has been solved before.
+        call_kernel(a[NEWTON], f, i, a, w, 0 if a[AT_ACTION] == 0 else 1, 0.0)
         for place in range(rows):
             row = n * PACK + place
             report[REPORT * row], report[REPORT * row + 1] = float(WARM), y[i[WORST] * PACK + place]
             report[REPORT * row + 2], report[REPORT * row + 3] = y[i[ITERATIONS] * PACK + place], 0.0
-            report[REPORT * row + 4] = y[i[FIRST_STEP] * PACK + place]
+            report[REPORT * row + 4] = y[i[SLOWNESS] * PACK + place]
             if y[i[CONVERGED] * PACK + place] > 0.5:
                 _tell(i, a, w, place, row)
                 continue
@@ -990,7 +1022,7 @@ def lanes(f, i, a, w, n, first):
                 _load(tension, muscles * row, y, i[TENSION], muscles, place)
                 _load(from_drive, muscles * row, y, i[FROM_DRIVE], muscles, place)
                 _load(from_load, LOAD * row, y, i[FROM_LOADS], LOAD, place)
-                _load(drive, muscles * row, y, i[TO_DRIVE], muscles, place)
+                _load(drive, drives * row, y, i[TO_DRIVE], muscles, place)
                 _load(load, LOAD * row, y, i[TO_LOADS], LOAD, place)
             call_kernel(a[FOLLOW], f, i, a, w, a[BUDGET], FIRST_SUBSTEP if first == 1.0 else first)
             before = report[REPORT * row + 2]
