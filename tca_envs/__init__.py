@@ -11,6 +11,7 @@ for _name, _task, _steps in (
         gymnasium.register(
             id=f"{_name}{_suffix}-v0",
             entry_point="tca_envs.env:ArmEnv",
+            vector_entry_point="tca_envs.vector:ArmVectorEnv",
             max_episode_steps=_steps,
             kwargs={"task": _task, "reward": _reward},
         )

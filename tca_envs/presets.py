@@ -10,7 +10,7 @@ from itertools import product
 from math import pi
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from tca_envs.mechanics import TCA, Arm, Gripper, Module, Muscle, Payload, check, discretise
 from tca_envs.mechanics.grasp import Box, Site
@@ -106,10 +106,17 @@ def with_object(place: ArrayLike = (0.0, 0.0, JAW_DEPTH)) -> Payload:
     place : (3,) array
         The object's centre in the frame of the twisting module's end [m].
     """
-    mass = GRIPPER_MASS + OBJECT.mass
-    moment = GRIPPER_MASS * np.array(GRIPPER_CENTRE) + OBJECT.mass * check.array("place", place, (3,))
-    x, y, z = (moment / mass).tolist()
+    mass, x, y, z = hanging(check.array("place", place, (3,))).tolist()
     return Payload(mass, (x, y, z))
+
+
+def hanging(place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return mass [kg] and centre of mass [m] (..., 4) of the gripper with the object, its centre at `place` (..., 3) [m]."""
+    mass = GRIPPER_MASS + OBJECT.mass
+    result = np.empty((*place.shape[:-1], 4))
+    result[..., 0] = mass
+    result[..., 1:] = (GRIPPER_MASS * np.array(GRIPPER_CENTRE) + OBJECT.mass * place) / mass
+    return result
 
 
 def whole_arm(tca: TCA | None = None, payload: Payload | None = None, tolerance: float = TOLERANCE) -> Arm:

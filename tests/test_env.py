@@ -12,6 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import tca_envs  # noqa: F401
+from tca_envs import batch
 from tca_envs.mechanics import collocation, grasp
 from tca_envs.mechanics.thermal import HARD_LIMIT, SOFT_LIMIT
 from tca_envs.tasks import core
@@ -250,7 +251,7 @@ def test_a_failed_solve_keeps_the_last_good_state_and_truncates(env, monkeypatch
     roll(env, actions(env, 5))
     unwrapped = env.unwrapped
     before = unwrapped.get_state()
-    observation = unwrapped._observe()
+    observation, _ = batch.look(unwrapped.task, unwrapped.core)
 
     def without_answer(arm, strain, tension, *rest):
         rest[-1][:] = (collocation.FAILED, 1.0, 7, 0, 0)
@@ -261,7 +262,7 @@ def test_a_failed_solve_keeps_the_last_good_state_and_truncates(env, monkeypatch
     assert info["solver"] == {"converged": False, "residual": 1.0, "iterations": 7, "rung": collocation.FAILED, "jumped": False}
     assert np.isfinite(reward)
     for key in observation:
-        assert observation[key].tobytes() == after[key].tobytes()
+        assert observation[key][0].tobytes() == after[key].tobytes()
     state = unwrapped.get_state()
     assert all(np.array_equal(before[key], state[key]) for key in before if key != "rng")
 
@@ -313,7 +314,7 @@ def test_every_lane_of_a_batch_equals_the_single_environment_bitwise(name):
     task = env.task
     many, rng = task.core(7), np.random.default_rng(0)
     singles = [task.core(1) for _ in range(7)]
-    goals, scenes = task.draw(many, rng, 7)
+    goals, scenes = task.draw(many, rng.spawn(7))
     many.reset(np.arange(7), goals, scenes)
     for i, single in enumerate(singles):
         single.reset(np.array([0]), goals[i : i + 1], scenes[i : i + 1])
@@ -323,6 +324,6 @@ def test_every_lane_of_a_batch_equals_the_single_environment_bitwise(name):
         for i, single in enumerate(singles):
             alone = task.step(single, command[i : i + 1])
             assert alone.tobytes() == report[i : i + 1].tobytes()
-            assert task.observe(single).tobytes() == task.observe(many)[i : i + 1].tobytes()
-            assert task.achieved(single.record).tobytes() == task.achieved(many.record)[i : i + 1].tobytes()
+            for one, all_lanes in zip(task.observe(single), task.observe(many), strict=True):
+                assert one.tobytes() == all_lanes[i : i + 1].tobytes()
             assert single.record.strain.tobytes() == many.record.strain[i : i + 1].tobytes()

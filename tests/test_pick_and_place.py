@@ -30,21 +30,26 @@ def test_object_and_target_can_be_reached_and_come_from_their_split(split):
     core = task.core(1)
     drawn, settle = [], core.settle
 
-    def remember(temperature, payload=None):
-        drawn.append((temperature[0].copy(), payload))
+    def remember(temperature, payload):
+        drawn.append((temperature, payload))
         return settle(temperature, payload)
 
     core.settle = remember
-    goals, scenes = task.draw(core, np.random.default_rng(0), 20)
-    for (first, empty), (last, full) in zip(drawn[::2], drawn[1::2], strict=True):
-        assert task.of_this_split(np.append(first, last[:3]))
-        assert empty is None and full[0] == pytest.approx(presets.GRIPPER_MASS + presets.OBJECT.mass)
-        assert (first[:3] <= 100.0).all() and first[3] <= 125.0 and (last[:3] <= 120.0).all() and last[3] == 25.0
-    # The last pair is the last episode's.
-    here, there = settle(drawn[-2][0][np.newaxis])[0], settle(drawn[-1][0][np.newaxis], drawn[-1][1])[0]
-    np.testing.assert_allclose(scenes[-1, [grasp.X, grasp.Y]], tool(here)[0, :2], atol=1e-12)
-    np.testing.assert_allclose(goals[-1, :2], 100.0 * tool(there)[0, :2], atol=1e-10)
-    assert np.sin(2.0 * (scenes[-1, grasp.YAW] - heading(here)[0])) == pytest.approx(0.0, abs=1e-9)
+    goals, scenes = task.draw(core, np.random.default_rng(0).spawn(20))
+    for temperature, payload in drawn:
+        for first, last in zip(*np.split(temperature, 2), strict=True):
+            assert task.of_this_split([*first, *last[:3]])
+            assert (first[:3] <= 100.0).all() and first[3] <= 125.0 and (last[:3] <= 120.0).all() and last[3] == 25.0
+        empty, full = np.split(payload, 2)
+        np.testing.assert_array_equal(empty, np.repeat(core.rest.payload, len(empty), axis=0))
+        np.testing.assert_allclose(full[:, 0], presets.GRIPPER_MASS + presets.OBJECT.mass)
+    # The last pair drawn is that of the last episode to be accepted.
+    (*_, first), (*_, last) = np.split(drawn[-1][0], 2)
+    here, there = settle(first[np.newaxis])[0], settle(last[np.newaxis], drawn[-1][1][-1])[0]
+    (which,) = np.flatnonzero(np.abs(scenes[:, grasp.X] - tool(here)[0, 0]) < 1e-12)
+    np.testing.assert_allclose(scenes[which, [grasp.X, grasp.Y]], tool(here)[0, :2], atol=1e-12)
+    np.testing.assert_allclose(goals[which, :2], 100.0 * tool(there)[0, :2], atol=1e-10)
+    assert np.sin(2.0 * (scenes[which, grasp.YAW] - heading(here)[0])) == pytest.approx(0.0, abs=1e-9)
     assert (np.linalg.norm(goals[:, :2] - 100.0 * scenes[:, [grasp.X, grasp.Y]], axis=1) >= APART_CM).all()
     np.testing.assert_allclose(goals[:, 2], AT_REST_CM)
     assert (goals[:, 3] == 1.0).all() and (scenes[:, grasp.HELD] == 0.0).all()
@@ -63,7 +68,7 @@ def test_object_and_target_can_be_reached_and_come_from_their_split(split):
 )
 def test_success_takes_the_place_and_the_gripper_away(task, achieved, success):
     desired = np.array([0.0, 0.0, AT_REST_CM, 1.0])
-    assert bool(task.success(np.array(achieved), desired)) is success
+    assert bool(task.judge(np.array(achieved), desired).success) is success
     assert gym.make("TCAPickAndPlace-v0").unwrapped.compute_reward(np.array(achieved), desired, {}) == success - 1.0
     distance = np.linalg.norm(np.array(achieved)[:3] - desired[:3])
     dense = gym.make("TCAPickAndPlaceDense-v0").unwrapped.compute_reward(np.array(achieved), desired, {})
@@ -156,7 +161,9 @@ def test_the_observation_says_what_is_there():
             assert seen[17] == 0.0
             np.testing.assert_allclose(record.payload, core.rest.payload)
         forces += seen[17] > 0.0
-        assert info["is_success"] is bool(env.unwrapped.task.success(observation["achieved_goal"], observation["desired_goal"]))
+        assert info["is_success"] is bool(
+            env.unwrapped.task.judge(observation["achieved_goal"], observation["desired_goal"]).success
+        )
     assert held > 20 and forces >= held and info["is_success"]
 
 

@@ -41,11 +41,11 @@ def test_goals_come_from_their_split(split, monkeypatch):
     settle = core.settle
 
     def remember(temperature):
-        drawn.append(temperature[0].copy())
+        drawn.extend(temperature)
         return settle(temperature)
 
     monkeypatch.setattr(core, "settle", remember)
-    task.draw(core, np.random.default_rng(0), 30)
+    task.draw(core, np.random.default_rng(0).spawn(30))
     assert len(drawn) == 30
     assert all(held_out(temperature) == (split == "held-out") for temperature in drawn)
 

@@ -46,7 +46,7 @@ def histories():
 @pytest.fixture
 def no_goals(monkeypatch):
     """Episodes without a goal: none has to be solved for."""
-    monkeypatch.setattr(Reach, "draw", lambda task, core, rng, count: (np.zeros((count, 3)), np.empty((count, 0))))
+    monkeypatch.setattr(Reach, "draw", lambda task, core, rngs: (np.zeros((len(rngs), 3)), np.empty((len(rngs), 0))))
 
 
 def changes(history):

@@ -36,8 +36,8 @@ def test_goals_come_from_their_split_and_are_all_reached_within_a_turn(split):
     core = task.core(1)
     drawn = []
     settle = core.settle
-    core.settle = lambda temperature: (drawn.append(temperature[0].copy()), settle(temperature))[1]
-    goals, scenes = task.draw(core, np.random.default_rng(0), 40)
+    core.settle = lambda temperature: (drawn.extend(temperature), settle(temperature))[1]
+    goals, scenes = task.draw(core, np.random.default_rng(0).spawn(40))
     assert scenes.shape == (40, 0)
     assert all(task.of_this_split(temperature) for temperature in drawn)
     np.testing.assert_allclose(np.hypot(goals[:, 3], goals[:, 4]), 1.0, atol=1e-12)
@@ -63,7 +63,7 @@ def test_goals_come_from_their_split_and_are_all_reached_within_a_turn(split):
 )
 def test_success_takes_1_5_millimetres_and_5_degrees(achieved, success):
     task = TwistAlign("train")
-    assert bool(task.success(achieved, goal())) is success
+    assert bool(task.judge(achieved, goal()).success) is success
     sparse = gym.make("TCATwistAlign-v0").unwrapped
     assert sparse.compute_reward(achieved, goal(), {}) == (0.0 if success else -1.0)
 
@@ -72,7 +72,7 @@ def test_success_takes_1_5_millimetres_and_5_degrees(achieved, success):
 def test_yaw_errors_do_not_depend_on_where_the_circle_is_cut(turn):
     task = TwistAlign("train")
     for error in (0.0, 3.0, -90.0, 179.0):
-        found = task.measures(goal(yaw=turn + error), goal(yaw=turn))
+        found = task.judge(goal(yaw=turn + error), goal(yaw=turn)).measures
         assert found["yaw_error_deg"] == pytest.approx(abs(error), abs=1e-9)
 
 

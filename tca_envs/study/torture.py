@@ -255,7 +255,9 @@ def drive(name: str, policy: str, steps: int, progress: Callable[[Iterable[int]]
     rng = np.random.default_rng(0)
     task = TASKS[name]("train", presets.TOLERANCE)
     plain = task.core(LANES)
-    goals, scenes = task.draw(plain, rng, GOALS)
+    # One by one: a generator that they share has to finish one episode before the next.
+    drawn = [task.draw(plain, [rng]) for _ in range(GOALS)]
+    goals, scenes = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
     core, record = Watched(plain), plain.record
     act = POLICIES[policy](rng, LANES, task.actions, record.temperature.shape[1])
     episode = gymnasium.spec(IDS[name]).max_episode_steps
@@ -266,15 +268,15 @@ def drive(name: str, policy: str, steps: int, progress: Callable[[Iterable[int]]
     stability: list[float] = []
     with no_collection():
         for i in progress(range(-(-steps // LANES))):
-            drawn = rng.integers(0, GOALS, over.sum())
-            core.reset(np.flatnonzero(over), goals[drawn], scenes[drawn])
+            chosen = rng.integers(0, GOALS, over.sum())
+            core.reset(np.flatnonzero(over), goals[chosen], scenes[chosen])
             age[over] = 0
             before = record.temperature.copy()
             told = task.step(core, act(core, age))
             age += 1
             over = (age == episode) | ~solved(told)
             change.append(np.linalg.norm(record.temperature - before, axis=1))
-            numbers = [task.observe(core), *(getattr(record, f.name) for f in fields(Record))]
+            numbers = [*task.observe(core), *(getattr(record, f.name) for f in fields(Record))]
             finite.append(np.all([np.isfinite(n.reshape(LANES, -1)).all(axis=1) for n in numbers], axis=0))
             rare = np.isin(told[:, 0], (Rung.FINER, Rung.DESCENT))
             if i % SAMPLED == 0:

@@ -96,6 +96,7 @@ class Core:
         self, arm: Arm, heater: Heater, lanes: int, goal_size: int, scene_size: int = 0, others: Sequence[float] = ()
     ) -> None:
         self.arm = arm
+        self.threads = 1  # that share the lanes
         self.heating = heater.scaled(np.append(arm.rest_lengths, others))
         self.rest, self.rest_report = self._rest(goal_size, scene_size)
         self.record = self.rest.rows(np.zeros(lanes, dtype=np.intp))
@@ -137,7 +138,7 @@ class Core:
         record.temperature[good] = temperature[good]
         return report
 
-    def reset(self, lanes: NDArray[np.intp], goals: Array, scenes: Array) -> None:
+    def reset(self, lanes: NDArray[np.intp], goals: Array | float, scenes: Array | float) -> None:
         """Put lanes at rest with new goals (len(lanes), k) and scenes (len(lanes), s); nothing of their past remains."""
         self.record.assign(lanes, self.rest)
         self.record.goal[lanes] = goals
@@ -176,7 +177,7 @@ class Core:
         ----------
         temperature : (N, n) array
             Steady temperatures of the arm's TCAs [degC]; others stay at ambient.
-        payload : (4,) array, optional
+        payload : (4,) or (N, 4) array, optional
             Another payload than the arm's, see `Record.payload`.
 
         Returns

@@ -1,6 +1,6 @@
 """PickAndPlace: grasp an object on the table and put it down elsewhere."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -13,7 +13,7 @@ from tca_envs.mechanics import grasp
 from tca_envs.mechanics.rotation import yaw, yaw_angle
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT, Heater
 from tca_envs.tasks.core import STEP_S, Core, Record, solved
-from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat
+from tca_envs.tasks.task import Array, Mask, Outcome, Single, Task, box_with_heat, distance, observed, rounds
 
 SUCCESS_CM = 0.3
 """An object at rest within 3 mm of the target, the gripper clear of it, is placed."""
@@ -135,31 +135,40 @@ class PickAndPlace(Task):
         super().__init__(split, tolerance)
         self.gripper = presets.gripper()
         self._pinch = pinch_table()
+        self._last_gap = (b"", np.empty(0))
 
     def core(self, lanes: int) -> Core:
         """Return `lanes` lanes of the whole arm; the gripper's TCA is heated, too."""
         return Core(presets.whole_arm(tolerance=self.tolerance), Heater(), lanes, 4, grasp.SCENE, [self.gripper.rest_length])
 
-    def draw(self, core: Core, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
-        """Return targets (count, 4) and scenes (count, SCENE) with the object under the tool of a steady state."""
+    def draw(self, core: Core, generators: Sequence[np.random.Generator]) -> tuple[Array, Array]:
+        """Return targets (N, 4) and scenes (N, SCENE) with the object under the tool of a steady state."""
         rest = grasp.resting(presets.OBJECT, presets.SITE)
-        carrying = presets.with_object()
-        goals = np.tile([0.0, 0.0, 100.0 * rest, 1.0], (count, 1))
-        scenes = np.zeros((count, grasp.SCENE))
+        goals = np.tile([0.0, 0.0, 100.0 * rest, 1.0], (len(generators), 1))
+        scenes = np.zeros((len(generators), grasp.SCENE))
         scenes[:, grasp.Z] = rest
-        for i in range(count):
-            far = False
-            while not far:
-                first = AMBIENT + (HOTTEST_OBJECT - AMBIENT) * rng.random(4)
-                last = AMBIENT + (HOTTEST_TARGET - AMBIENT) * rng.random(4)
-                if self.of_this_split(np.append(first, last[:3])):
-                    here, good_here = core.settle(first[np.newaxis])
-                    there, good_there = core.settle(last[np.newaxis], np.array([carrying.mass, *carrying.centre]))
-                    scenes[i, grasp.X : grasp.Z] = tool(here)[0, :2]
-                    goals[i, :2] = 100.0 * tool(there)[0, :2]
-                    apart = np.linalg.norm(goals[i, :2] - 100.0 * scenes[i, grasp.X : grasp.Z])
-                    far = bool(good_here[0] and good_there[0] and apart >= APART_CM)
-            scenes[i, grasp.YAW] = grasp.half_turn(heading(here))[0]
+        carrying = presets.hanging(np.array([0.0, 0.0, presets.JAW_DEPTH]))
+
+        def candidate(generator: np.random.Generator) -> list[float]:
+            while True:
+                first = (AMBIENT + (HOTTEST_OBJECT - AMBIENT) * generator.random(4)).tolist()
+                last = (AMBIENT + (HOTTEST_TARGET - AMBIENT) * generator.random(4)).tolist()
+                if self.of_this_split(first + last[:3]):
+                    return [*first, *last]
+
+        def accepted(which: NDArray[np.intp], temperature: Array) -> Mask:
+            # All empty arms first, then all that carry the object.
+            payload = np.repeat([core.rest.payload[0], carrying], which.size, axis=0)
+            record, good = core.settle(np.concatenate([temperature[:, :4], temperature[:, 4:]]), payload)
+            place = tool(record)[:, :2]
+            here, there = place[: which.size], place[which.size :]
+            scenes[which, grasp.X : grasp.Z] = here
+            scenes[which, grasp.YAW] = grasp.half_turn(heading(record)[: which.size])
+            goals[which, :2] = 100.0 * there
+            apart = 100.0 * there - 100.0 * here
+            return good[: which.size] & good[which.size :] & (np.hypot(apart[:, 0], apart[:, 1]) >= APART_CM)
+
+        rounds(generators, candidate, accepted)
         return goals, scenes
 
     def step(self, core: Core, action: Array) -> Array:
@@ -167,14 +176,22 @@ class PickAndPlace(Task):
         report = core.step(action[:, :5])
         record = core.record
         lowering = presets.STAGE_SPEED * STEP_S * np.clip(action[:, 5], -1.0, 1.0)
-        gap, pinch = self.gripper.gap(record.temperature[:, 4]), self.pinch(record)
+        gap, pinch = self.gap(record), self.pinch(record)
         scene = grasp.step(record.scene, tool(record), heading(record), gap, pinch, lowering, presets.OBJECT, presets.SITE)
         record.scene[:] = np.where(solved(report)[:, np.newaxis], scene, record.scene)
         record.payload[:] = core.rest.payload
-        for lane in np.flatnonzero(record.scene[:, grasp.HELD]):
-            hanging = presets.with_object(grasp.in_mount(record.scene[lane], record.tip[lane]))
-            record.payload[lane] = (hanging.mass, *hanging.centre)
+        held = np.flatnonzero(record.scene[:, grasp.HELD])
+        if held.size:
+            record.payload[held] = presets.hanging(grasp.in_mount(record.scene[held], record.tip[held]))
         return report
+
+    def gap(self, record: Record) -> Array:
+        """Return the distance (N,) of the jaws without an object [m]."""
+        # A step asks for it twice, to act and to observe, and it takes as long as all else that is observed.
+        temperature = record.temperature[:, 4].tobytes()
+        if temperature != self._last_gap[0]:
+            self._last_gap = (temperature, self.gripper.gap(record.temperature[:, 4]))
+        return self._last_gap[1]
 
     def pinch(self, record: Record) -> Array:
         """Return the force (N,) with which each jaw would press on the object between them [N]."""
@@ -185,45 +202,28 @@ class PickAndPlace(Task):
         scene = record.scene
         return np.column_stack([100.0 * scene[:, grasp.X : grasp.Z + 1], scene[:, grasp.TOUCHED] < 0.5])
 
-    def observe(self, core: Core) -> Array:
-        """Return what a controller measures (N, 23)."""
+    def observe(self, core: Core) -> tuple[Single, Single]:
+        """Return what a controller measures (N, 23), and the object's position [cm] and whether it lies there free (N, 4)."""
         record, scene = core.record, core.record.scene
+        result, lying = observed(core, 23), self.achieved(record).astype(np.float32)
         between = (scene[:, grasp.HELD] > 0.5) | (scene[:, grasp.ASTRIDE] > 0.5)
-        gap = self.gripper.gap(record.temperature[:, 4])
-        opening = np.where(between, np.maximum(gap, presets.OBJECT.width), gap)
+        gap = self.gap(record)
         place = tool(record)
         place[:, 2] += scene[:, grasp.STAGE]
-        return np.column_stack(
-            [
-                heat(core),
-                100.0 * place,
-                *yaw(record.tip),
-                scene[:, grasp.STAGE] / presets.STAGE_TRAVEL,
-                100.0 * opening,
-                np.where(between, self.pinch(record), 0.0) / FULL_FORCE,
-                100.0 * scene[:, grasp.X : grasp.Z + 1],
-                np.cos(2.0 * scene[:, grasp.YAW]),
-                np.sin(2.0 * scene[:, grasp.YAW]),
-            ]
-        )
+        result[:, TOOL] = 100.0 * place
+        result[:, TOOL_COS], result[:, TOOL_SIN] = yaw(record.tip)
+        result[:, TRAVEL] = scene[:, grasp.STAGE] / presets.STAGE_TRAVEL
+        result[:, OPENING] = 100.0 * np.where(between, np.maximum(gap, presets.OBJECT.width), gap)
+        result[:, FORCE] = np.where(between, self.pinch(record), 0.0) / FULL_FORCE
+        result[:, OBJECT] = lying[:, :3]
+        result[:, OBJECT_COS2] = np.cos(2.0 * scene[:, grasp.YAW])
+        result[:, OBJECT_SIN2] = np.sin(2.0 * scene[:, grasp.YAW])
+        return result, lying
 
-    @staticmethod
-    def distance(achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
-        """Return the distance of object and target [cm] over the last axis."""
-        a, d = np.asarray(achieved, dtype=np.float64), np.asarray(desired, dtype=np.float64)
-        return np.linalg.norm(a[..., :3] - d[..., :3], axis=-1)
-
-    def success(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mask:
-        """Return whether the object lies free within the tolerance of the target, over the last axis."""
-        return (self.distance(achieved, desired) <= SUCCESS_CM) & (np.asarray(achieved)[..., 3] > 0.5)
-
-    def dense_reward(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
-        """Return minus the distance [cm] over the last axis."""
-        return -self.distance(achieved, desired)
-
-    def measures(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mapping[str, Array]:
-        """Return what `info` reports of goals, by key."""
-        return {"distance_mm": 10.0 * self.distance(achieved, desired)}
+    def judge(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Outcome:
+        """Return what is to be said of goals (..., 4)."""
+        away = distance(achieved, desired)
+        return Outcome((away <= SUCCESS_CM) & (achieved[..., 3] > 0.5), -away, {"distance_mm": 10.0 * away})
 
 
 PINCH_AT = np.arange(AMBIENT, HARD_LIMIT + 1.0)

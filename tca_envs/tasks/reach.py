@@ -1,6 +1,6 @@
 """Reach: heat the bending module so that its tip comes to rest at a goal."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tca_envs import presets
 from tca_envs.mechanics.thermal import Heater
 from tca_envs.tasks.core import Core, Record
-from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat, steady_goals
+from tca_envs.tasks.task import Array, Outcome, Single, Task, box_with_heat, distance, observed, steady_goals
 
 SUCCESS_CM = 0.1
 """A tip within 1 mm of the goal has reached it."""
@@ -94,31 +94,21 @@ class Reach(Task):
         """Return `lanes` lanes of the bending module with the rest of the arm as dead weight."""
         return Core(presets.bending_arm(tolerance=self.tolerance), Heater(), lanes, goal_size=3)
 
-    def draw(self, core: Core, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
-        """Return tips (count, 3) [cm] at steady temperatures of this task's split; there is no scene."""
-        return steady_goals(self, core, rng, count), np.empty((count, 0))
+    def draw(self, core: Core, generators: Sequence[np.random.Generator]) -> tuple[Array, Array]:
+        """Return tips (N, 3) [cm] at steady temperatures of this task's split; there is no scene."""
+        return steady_goals(self, core, generators), np.empty((len(generators), 0))
 
     def achieved(self, record: Record) -> Array:
         """Return what is compared with the goal (N, 3): tip position [cm]."""
         return 100.0 * record.tip[:, :3, 3]
 
-    def observe(self, core: Core) -> Array:
-        """Return what a controller measures (N, 9)."""
-        return np.hstack([heat(core), self.achieved(core.record)])
+    def observe(self, core: Core) -> tuple[Single, Single]:
+        """Return what a controller measures (N, 9) and the tip's position (N, 3) [cm]."""
+        result, tip = observed(core, 9), self.achieved(core.record).astype(np.float32)
+        result[:, 6:] = tip
+        return result, tip
 
-    @staticmethod
-    def distance(achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
-        """Return the distance [cm] over the last axis."""
-        return np.linalg.norm(np.asarray(achieved, dtype=np.float64) - np.asarray(desired, dtype=np.float64), axis=-1)
-
-    def success(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mask:
-        """Return whether the goal is reached, over the last axis."""
-        return self.distance(achieved, desired) <= SUCCESS_CM
-
-    def dense_reward(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
-        """Return minus the distance [cm] over the last axis."""
-        return -self.distance(achieved, desired)
-
-    def measures(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mapping[str, Array]:
-        """Return what `info` reports of goals, by key."""
-        return {"distance_mm": 10.0 * self.distance(achieved, desired)}
+    def judge(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Outcome:
+        """Return what is to be said of goals (..., 3)."""
+        away = distance(achieved, desired)
+        return Outcome(away <= SUCCESS_CM, -away, {"distance_mm": 10.0 * away})

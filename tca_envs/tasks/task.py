@@ -1,8 +1,9 @@
 """What every task is made of, and what the environment asks of it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from math import floor
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -15,6 +16,7 @@ from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT
 from tca_envs.tasks.core import CUT_OFF, Core, Record
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 CELL_K = 25.0
@@ -22,6 +24,16 @@ CELL_K = 25.0
 SPLITS = ("train", "held-out")
 HOTTEST = float(np.ceil(10.0 * (CUT_OFF - AMBIENT) / (SOFT_LIMIT - AMBIENT)) / 10.0)
 """Upper bound of a scaled temperature."""
+
+
+class Outcome(NamedTuple):
+    """What is said of goals, over the last axis."""
+
+    success: Mask
+    """Whether they are reached."""
+    dense_reward: Array
+    measures: Mapping[str, Array]
+    """What `info` reports, by key."""
 
 
 class Task(ABC):
@@ -51,8 +63,8 @@ class Task(ABC):
         """Return `lanes` lanes of this task's arm."""
 
     @abstractmethod
-    def draw(self, core: Core, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
-        """Return goals (count, k) and scenes (count, s) of new episodes, of this task's split."""
+    def draw(self, core: Core, generators: Sequence[np.random.Generator]) -> tuple[Array, Array]:
+        """Return goals (N, k) and scenes (N, s) of new episodes of this task's split, each drawn by its own generator."""
 
     def step(self, core: Core, action: Array) -> Array:
         """Advance all lanes by one step under actions (N, a); returns the solver's report, see `Core.step`."""
@@ -63,57 +75,90 @@ class Task(ABC):
         """Return what is compared with the goal (N, k)."""
 
     @abstractmethod
-    def observe(self, core: Core) -> Array:
-        """Return what a controller measures (N, o)."""
+    def observe(self, core: Core) -> tuple[Single, Single]:
+        """Return what a controller measures (N, o) and what is compared with the goal (N, k)."""
 
     @abstractmethod
-    def success(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mask:
-        """Return whether goals are reached, over the last axis."""
+    def judge(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Outcome:
+        """Return what is to be said of goals (..., k)."""
 
-    @abstractmethod
-    def dense_reward(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
-        """Return the dense reward over the last axis."""
-
-    @abstractmethod
-    def measures(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mapping[str, Array]:
-        """Return what `info` reports of goals, by key."""
-
-    def of_this_split(self, temperature: Array) -> bool:
+    def of_this_split(self, temperature: Sequence[float]) -> bool:
         """Return whether goals at `temperature` (n,) [degC] belong to this task's split."""
         return held_out(temperature) == (self.split == "held-out")
 
 
-def steady_goals(task: Task, core: Core, rng: np.random.Generator, count: int) -> Array:
-    """Return what `count` arms achieve (count, k) in steady states of the task's split, drawn uniformly up to the soft limit.
+def rounds(
+    generators: Sequence[np.random.Generator],
+    candidate: Callable[[np.random.Generator], list[float]],
+    accepted: Callable[[NDArray[np.intp], Array], Mask],
+) -> None:
+    """Let each generator draw candidates until one is accepted; all that wait for that are judged at once.
+
+    Parameters
+    ----------
+    generators : sequence of numpy.random.Generator
+        N of them.
+    candidate : callable
+        Draws one.
+    accepted : callable
+        Of the indices of p generators (p,) and their candidates (p, c): which ones are accepted (p,); it keeps those.
+    """
+    waiting = np.arange(len(generators))
+    while waiting.size:
+        drawn = np.array([candidate(generators[i]) for i in waiting.tolist()])
+        waiting = waiting[~accepted(waiting, drawn)]
+
+
+def steady_goals(task: Task, core: Core, generators: Sequence[np.random.Generator]) -> Array:
+    """Return what arms achieve (N, k) in steady states of the task's split, drawn uniformly up to the soft limit.
 
     Where the arm could end on several sides, other temperatures are drawn, see `Core.settle`.
     """
-    goals = np.empty((count, core.record.goal.shape[1]))
-    for i in range(count):
-        settled = False
-        while not settled:
-            temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * rng.random(len(core.arm.muscles))
+    goals = np.empty((len(generators), core.record.goal.shape[1]))
+    muscles = len(core.arm.muscles)
+
+    def candidate(generator: np.random.Generator) -> list[float]:
+        while True:
+            temperature: list[float] = (AMBIENT + (SOFT_LIMIT - AMBIENT) * generator.random(muscles)).tolist()
             if task.of_this_split(temperature):
-                record, good = core.settle(temperature[np.newaxis])
-                settled = bool(good[0])
-        goals[i] = task.achieved(record)[0]
+                return temperature
+
+    def accepted(which: NDArray[np.intp], temperature: Array) -> Mask:
+        record, good = core.settle(temperature)
+        goals[which] = task.achieved(record)
+        return good
+
+    rounds(generators, candidate, accepted)
     return goals
 
 
-def held_out(temperature: Array) -> bool:
+def held_out(temperature: Sequence[float]) -> bool:
     """Return whether goals at `temperature` (n,) [degC] are held out: one cell in five, spread evenly over the space."""
-    cells = np.floor((temperature - AMBIENT) / CELL_K).astype(int)
-    return bool((cells * (np.arange(cells.size) % 4 + 1)).sum() % 5 == 0)
+    return sum(floor((t - AMBIENT) / CELL_K) * (i % 4 + 1) for i, t in enumerate(temperature)) % 5 == 0
 
 
-def heat(core: Core) -> Array:
-    """Return the observation of the heated TCAs (N, 2 m): temperatures from 0 (25 degC) to 1 (150 degC), powers from 0 to 1."""
-    temperature = (core.record.temperature - AMBIENT) / (SOFT_LIMIT - AMBIENT)
-    return np.hstack([temperature, core.record.power / core.heating.max_power])
+def observed(core: Core, count: int) -> Single:
+    """Return observations (N, count) of which the first 2 m numbers are filled: what is measured of the m heated TCAs.
+
+    These are temperatures from 0 (25 degC) to 1 (150 degC), then powers from 0 to 1.
+    """
+    temperature, power = core.record.temperature, core.record.power
+    lanes, muscles = temperature.shape
+    result = np.empty((lanes, count), dtype=np.float32)
+    result[:, :muscles] = (temperature - AMBIENT) / (SOFT_LIMIT - AMBIENT)
+    result[:, muscles : 2 * muscles] = power / core.heating.max_power
+    return result
+
+
+def distance(achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
+    """Return the distance of the first three coordinates over the last axis, in double precision."""
+    apart = achieved.astype(np.float64) - desired
+    x, y, z = apart[..., 0], apart[..., 1], apart[..., 2]
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 def box_with_heat(count: int, low: list[float], high: list[float]) -> spaces.Box:
-    """Return the space of `heat` for `count` TCAs, followed by numbers from `low` to `high`."""
+    """Return the space of `observed` for `count` TCAs, followed by numbers from `low` to `high`."""
     return spaces.Box(
         np.array([0.0] * (2 * count) + low, dtype=np.float32),
         np.array([HOTTEST] * count + [1.0] * count + high, dtype=np.float32),

@@ -1,6 +1,6 @@
 """TwistAlign: bring the gripper over a place and turn it to a yaw."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from tca_envs import presets
 from tca_envs.mechanics.rotation import yaw
 from tca_envs.mechanics.thermal import Heater
 from tca_envs.tasks.core import Core, Record
-from tca_envs.tasks.task import Array, Mask, Task, box_with_heat, heat, steady_goals
+from tca_envs.tasks.task import Array, Outcome, Single, Task, box_with_heat, distance, observed, steady_goals
 
 SUCCESS_CM = 0.15
 """A tip within 1.5 mm of the goal is over it ..."""
@@ -106,38 +106,28 @@ class TwistAlign(Task):
         """Return `lanes` lanes of the whole arm."""
         return Core(presets.whole_arm(tolerance=self.tolerance), Heater(), lanes, goal_size=5)
 
-    def draw(self, core: Core, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
-        """Return tip positions [cm] and yaws (count, 5) at steady temperatures of this task's split; there is no scene."""
-        return steady_goals(self, core, rng, count), np.empty((count, 0))
+    def draw(self, core: Core, generators: Sequence[np.random.Generator]) -> tuple[Array, Array]:
+        """Return tip positions [cm] and yaws (N, 5) at steady temperatures of this task's split; there is no scene."""
+        return steady_goals(self, core, generators), np.empty((len(generators), 0))
 
     def achieved(self, record: Record) -> Array:
         """Return what is compared with the goal (N, 5): tip position [cm], cosine and sine of its yaw."""
         return np.column_stack([100.0 * record.tip[:, :3, 3], *yaw(record.tip)])
 
-    def observe(self, core: Core) -> Array:
-        """Return what a controller measures (N, 13)."""
-        return np.hstack([heat(core), self.achieved(core.record)])
+    def observe(self, core: Core) -> tuple[Single, Single]:
+        """Return what a controller measures (N, 13), and tip position [cm], cosine and sine of the yaw (N, 5)."""
+        result, pose = observed(core, 13), self.achieved(core.record).astype(np.float32)
+        result[:, 8:] = pose
+        return result, pose
 
-    @staticmethod
-    def errors(achieved: NDArray[Any], desired: NDArray[Any]) -> tuple[Array, Array]:
-        """Return distance [cm] and yaw error [deg], 0 to 180, over the last axis."""
+    def judge(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Outcome:
+        """Return what is to be said of goals (..., 5); a tolerance of yaw weighs like one of distance in the dense reward."""
         a, d = np.asarray(achieved, dtype=np.float64), np.asarray(desired, dtype=np.float64)
         sine = a[..., 4] * d[..., 3] - a[..., 3] * d[..., 4]
         cosine = a[..., 3] * d[..., 3] + a[..., 4] * d[..., 4]
-        distance = np.linalg.norm(a[..., :3] - d[..., :3], axis=-1)
-        return distance, np.degrees(np.abs(np.arctan2(sine, cosine)))
-
-    def success(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mask:
-        """Return whether tip and yaw are within their tolerances, over the last axis."""
-        distance, turn = self.errors(achieved, desired)
-        return (distance <= SUCCESS_CM) & (turn <= SUCCESS_DEG)
-
-    def dense_reward(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
-        """Return minus distance [cm] and yaw error, a tolerance of which weighs like one of distance, over the last axis."""
-        distance, turn = self.errors(achieved, desired)
-        return -distance - SUCCESS_CM / SUCCESS_DEG * turn
-
-    def measures(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Mapping[str, Array]:
-        """Return what `info` reports of goals, by key."""
-        distance, turn = self.errors(achieved, desired)
-        return {"distance_mm": 10.0 * distance, "yaw_error_deg": turn}
+        away, turn = distance(a, d), np.degrees(np.abs(np.arctan2(sine, cosine)))
+        return Outcome(
+            (away <= SUCCESS_CM) & (turn <= SUCCESS_DEG),
+            -away - SUCCESS_CM / SUCCESS_DEG * turn,
+            {"distance_mm": 10.0 * away, "yaw_error_deg": turn},
+        )
