@@ -253,8 +253,8 @@ def test_a_failed_solve_keeps_the_last_good_state_and_truncates(env, monkeypatch
     before = unwrapped.get_state()
     observation, _ = batch.look(unwrapped.task, unwrapped.core)
 
-    def without_answer(arm, strain, tension, *rest):
-        rest[-1][:] = (collocation.FAILED, 1.0, 7, 0, 0)
+    def without_answer(*arguments):
+        arguments[9][:] = (collocation.FAILED, 1.0, 7, 0, 0)
 
     monkeypatch.setattr(core.ladder, "solve", without_answer)
     after, reward, terminated, truncated, info = unwrapped.step(np.ones(env.action_space.shape, np.float32))

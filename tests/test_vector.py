@@ -61,10 +61,10 @@ def failing(monkeypatch):
     """A solver that has no answer where the first TCA is hotter than 50 degC; goals are drawn without one."""
     solve = core.ladder.solve
 
-    def solve_or_fail(arm, strain, tension, drive, load, asked, new_load, tip, lengths, report):
+    def solve_or_fail(arm, strain, tension, drive, load, asked, new_load, tip, lengths, report, *rest):
         state = (strain, tension, drive, load, tip, lengths)
         before = [values.copy() for values in state]
-        solve(arm, *state[:4], asked, new_load, tip, lengths, report)
+        solve(arm, *state[:4], asked, new_load, tip, lengths, report, *rest)
         bad = asked[:, 0] > 50.0
         for values, kept in zip(state, before, strict=True):
             values[bad] = kept[bad]

@@ -8,7 +8,6 @@ A matrix is its nine numbers, row by row. A quaternion is (w, x, y, z).
 
 from typing import Any
 
-import numpy as np
 from numba import njit
 
 # Not nnan or ninf: overflow must stay visible.
@@ -20,6 +19,7 @@ OPTIONS: dict[str, Any] = {
     "no_cfunc_wrapper": True,
 }
 INNER: dict[str, Any] = {"no_cpython_wrapper": True, **OPTIONS}
+ORIGIN = (0.0, 0.0, 0.0)
 CALLED: dict[str, Any] = {name: OPTIONS[name] for name in ("cache", "error_model", "fastmath")}
 """Options of kernels that are called by address."""
 entry = njit(**OPTIONS)

@@ -11,12 +11,31 @@ from numpy.typing import NDArray
 from tca_envs.mechanics import kernels
 from tca_envs.mechanics.algebra import CALLED, apply, dot, entry, inner, parallel, rotation_matrix
 from tca_envs.mechanics.kernels import (
-    AT_ACTION, AT_HEATING, AT_POWER, AT_STRAIN, AT_TEMPERATURE, BUDGET, CLOSED_FORM, COUNT, DESCENT, FAILED, FINER, HEAT, HEATED,
-    JOB, LANES, LOAD, MAX_ITERATIONS, NEUTRAL, PAYLOAD_MASS, REPORT, SMALLEST_SUBSTEP, SUBSTEPS, WARM,
+    AT_ACTION,
+    AT_HEATING,
+    AT_POWER,
+    AT_STRAIN,
+    AT_TEMPERATURE,
+    BUDGET,
+    COUNT,
+    HEAT,
+    HEATED,
+    JOB,
+    LANES,
+    LOAD,
+    MAX_ITERATIONS,
+    PAYLOAD_MASS,
 )  # fmt: skip
 from tca_envs.mechanics.muscle import PARAMETERS, TENDON, elongation, pull, stored
 from tca_envs.mechanics.packs import (
-    ALIGNMENT, KERNEL, PACK, address_of, call_kernel, pointer_to_floats, pointer_to_ints, pointer_to_packs,
+    ALIGNMENT,
+    KERNEL,
+    PACK,
+    address_of,
+    call_kernel,
+    pointer_to_floats,
+    pointer_to_ints,
+    pointer_to_packs,
 )  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -97,7 +116,9 @@ class _Scratch(threading.local):
 _scratch = _Scratch()
 
 
-def solve_lanes(model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, first=1.0, threads=1, heat=None):
+def solve_lanes(
+    model, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, first=1.0, threads=1, heat=None
+):
     """Follow the branches of N arms of one model, each from its own known equilibrium.
 
     Parameters
@@ -144,7 +165,7 @@ def budget(model):
 
 @cache
 def addresses() -> NDArray[np.int64]:
-    """Return the addresses of the kernels; compiles them, or loads them from the cache, which is no part of the time of a solve."""
+    """Return the addresses of the kernels; compiles them, or loads them from the cache: no part of the time of a solve."""
     made = (
         kernels.evaluate, kernels.eliminate, kernels.substitute, kernels.newton, kernels.follow, kernels.heat, kernels.lanes,
     )  # fmt: skip
@@ -190,8 +211,8 @@ def _solve_serially(
     temperature, power, constants,
 ):  # fmt: skip
     job = _job(
-        addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action, temperature, power,
-        constants,
+        addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report,
+        action, temperature, power, constants,
     )  # fmt: skip
     for n in range((len(strain) + PACK - 1) // PACK):
         _solve_pack(f, i, job, pointer_to_packs(w), n, first)
@@ -203,8 +224,8 @@ def _solve_in_parallel(
     temperature, power, constants,
 ):  # fmt: skip
     job = _job(
-        addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action, temperature, power,
-        constants,
+        addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report,
+        action, temperature, power, constants,
     )  # fmt: skip
     for n in prange((len(strain) + PACK - 1) // PACK):
         _solve_pack(f, i, job, pointer_to_packs(w[get_thread_id()]), n, first)

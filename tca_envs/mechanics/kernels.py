@@ -33,9 +33,9 @@ from tca_envs.mechanics.algebra import (
     cross,
     dot,
     inner,
-    merged,
     inverse,
     matmul,
+    merged,
     outer,
     quaternion_rate,
     quaternion_turn,
@@ -99,18 +99,18 @@ REPORT = 5
     MATRIX, PHI, PULLED, BASE, STRETCH, HANDED, BETA, MUSCLE_MATRIX, MUSCLE_PHI, MUSCLE_MOMENT,
     GAMMA, SOURCES, ANSWER, TURNED, BEND, SHEAR, CHANGE, TIP, END,
 ) = range(88)  # fmt: skip
-"""Places in `i`. The first six are sizes of the arm: modules M, muscles n, nodes G, elements E, most nodes Q of an element, most
-muscles m of a module. The next four are where its integers begin in `i` itself: M elements, M nodes of an element, M + 1
-first muscles, n kinds. Then, where its numbers begin in `f`, see `tables`; and, from STRAIN on, where arrays begin among
-the packs, see `layout`. END is the number of packs in all."""
+"""Places in `i`. The first six are sizes of the arm: modules M, muscles n, nodes G, elements E, most nodes Q of an element,
+most muscles m of a module. The next four are where its integers begin in `i` itself: M elements, M nodes of an element, M + 1
+first muscles, n kinds. Then, where its numbers begin in `f`, see `collocation.flat`; and, from STRAIN on, where arrays begin
+among the packs, see `layout`. END is the number of packs in all."""
 (
     EVALUATE, ELIMINATE, SUBSTITUTE, NEWTON, FOLLOW, HEAT, LANES,
     AT_STRAIN, AT_TENSION, AT_FROM_DRIVE, AT_FROM_LOAD, AT_DRIVE, AT_LOAD, AT_TIP, AT_LENGTHS, AT_REPORT,
     AT_ACTION, AT_TEMPERATURE, AT_POWER, AT_HEATING, COUNT, BUDGET, HEATED, JOB,
 ) = range(24)  # fmt: skip
-"""Places in `a`: kernels, then the arrays of `collocation.solve_lanes` and of `collocation.Heat`, how many lanes they have, how many
-iterations a lane may take, and how many drives a lane has: TCAs, where they are heated, that are not the arm's come after those
-that are. JOB is the number of places."""
+"""Places in `a`: kernels, then the arrays of `collocation.solve_lanes` and of `collocation.Heat`, how many lanes they have,
+how many iterations a lane may take, and how many drives a lane has: TCAs, where they are heated, that are not the arm's come
+after those that are. JOB is the number of places."""
 KEPT_SHARE, LOST_SHARE, LOSS, MAX_POWER, AMBIENT_AT, LIMIT_AT = range(6)
 """Rows of the array at AT_HEATING (6, HEATED)."""
 
@@ -131,7 +131,7 @@ def layout(modules: int, n: int, nodes: int, elements: int, wide: int, most: int
         9 * q * g,  # rows g Q + l: block of node l in the balance of node g, then its factors
         9 * g, 3 * m * g,  # w from the rotation at the element's base and from dF
         9 * g, 3 * m * g,  # moment at the element's base and path lengths from w
-        12 * m, m * m, modules * m * m, 3 * modules * m, 3 * modules * m,  # Q, alpha and successors; beta; factors of the muscles
+        12 * m, m * m, modules * m * m, 3 * modules * m, 3 * modules * m,  # Q, alpha and successors; beta; muscles' factors
         m, 6 * q, 3 * g, 3 * g, 3 * g, 3 * g, n, 6,  # gamma; rho, zeta; w; rotations; du, dv (body frame); dF; of the tip
     )  # fmt: skip
 
@@ -304,8 +304,8 @@ def evaluate(f, i, a, w, guessed, __):
     Rotations, wrenches and residuals go to their places; the quaternions there are near those of this state if they are
     `guessed`. Tensions of tendons are set to their drives. WORST is the dimensionless residual: the largest of |moment
     imbalance| L/K (an angle over the module), |force imbalance|/K (a strain) and |length mismatch|/rest length; TOTAL the sum
-    of squares of all of them. Both inf where the state is no configuration (a rotation that the nodes cannot resolve, a muscle path
-    that shrinks to a point).
+    of squares of all of them. Both inf where the state is no configuration (a rotation that the nodes cannot resolve, a muscle
+    path that shrinks to a point).
     """
     modules, muscles, wide, most = i[MODULES], i[MUSCLES], i[WIDE], i[MOST]
     strain, tension, drive, load = i[STRAIN], i[TENSION], i[DRIVE], i[LOADS]
@@ -459,7 +459,11 @@ def _section(f, i, w, k, g, j, damping):
     y_block = matmul(matmul(r, across(n, slide)), back)
     put9(w, i[Y_BLOCK] + 9 * j, y_block)
     # G [n] = -Y^T, and R [R^T m] R^T = [m].
-    put9(w, i[N_BLOCK] + 9 * j, axpy9(-1.0, add_cross(get3(w, i[MOMENT] + 3 * g), transpose(y_block)), diagonal(nothing, nothing, nothing)))
+    put9(
+        w,
+        i[N_BLOCK] + 9 * j,
+        axpy9(-1.0, add_cross(get3(w, i[MOMENT] + 3 * g), transpose(y_block)), diagonal(nothing, nothing, nothing)),
+    )
     # [n] B [n] = -[n] ([n] B)^T.
     along = -dot(v, n)
     x_block = axpy9(1.0, across(n, transpose(nf)), axpy9(1.0, outer(v, n), diagonal(along, along, along)))
@@ -562,7 +566,10 @@ def eliminate(f, i, a, w, _, damping):
                 for c2 in range(mk):
                     gained = w[beta + c * most + c2]
                     for j in range(q):
-                        t, t2 = get3(w, wrench + 6 * ((g0 + j) * most + c) + 3), get3(w, wrench + 6 * ((g0 + j) * most + c2) + 3)
+                        t, t2 = (
+                            get3(w, wrench + 6 * ((g0 + j) * most + c) + 3),
+                            get3(w, wrench + 6 * ((g0 + j) * most + c2) + 3),
+                        )
                         gained -= h * f[b + j] * dot(t, apply(get9(w, compliance + 9 * (g0 + j)), t2))
                     w[beta + c * most + c2] = gained
             index += _factorise_blocks(i, w, inside, g0, q, mk)
@@ -683,8 +690,8 @@ def _solve(w, matrix, order, stride, x):
 def substitute(f, i, a, w, _, __):
     """Solve the factorised tangent for the right-hand side -(RESIDUAL, GAP).
 
-    Writes the changes of strain (BEND, SHEAR), tension (CHANGE) and tip (TIP), the rotation of each node (TURNED), and the largest
-    rotation [rad] (ROTATED) and the largest |dv| (SHEARED) of the step.
+    Writes the changes of strain (BEND, SHEAR), tension (CHANGE) and tip (TIP), the rotation of each node (TURNED), and the
+    largest rotation [rad] (ROTATED) and the largest |dv| (SHEARED) of the step.
     """
     modules, wide, most = i[MODULES], i[WIDE], i[MOST]
     matrix, answer, change, gamma, sources = i[MATRIX], i[ANSWER], i[CHANGE], i[GAMMA], i[SOURCES]
@@ -782,8 +789,8 @@ def substitute(f, i, a, w, _, __):
     # No number is the largest where one is not a number.
     whole = dot(phi0, phi0)
     rotated = largest(rotated, whole)
-    w[i[ROTATED]] = choose(size(whole), np.inf, root(rotated), np.inf)
-    w[i[SHEARED]] = choose(size(dot(dp, dp)), np.inf, root(sheared), np.inf)
+    w[i[ROTATED]] = choose(size(whole), np.inf, root(rotated), np.nan)
+    w[i[SHEARED]] = choose(size(dot(dp, dp)), np.inf, root(sheared), np.nan)
 
 
 def newton(f, i, a, w, certified, __):
@@ -792,13 +799,14 @@ def newton(f, i, a, w, certified, __):
     Newton must go straight to the answer. It gives up where a step turns a section by more than MAX_ROTATION_STEP; where a step
     is not CONTRACTION times shorter than the one before; or if it takes long. For a solve that has to be steered may end on
     another branch. One that contracts finds the only equilibrium nearby (the theorem of Newton and Kantorovich in affine
-    covariant form; Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 5.1). Where steps shrink to less than a quarter
-    that holds for all the way from the start, so the answer is on the start's branch; where they do not, going back tells,
-    `ladder.returns`. What has MOVED, drive or load, takes a step
-    even where the start would do: a small change moves the arm a little, not in jerks.
+    covariant form; Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 5.1). Where steps shrink to less than a
+    quarter that holds for all the way from the start, so the answer is on the start's branch; where they do not, going back
+    tells, `ladder.returns`. What has MOVED, drive or load, takes a step even where the start would do: a small change moves the
+    arm a little, not in jerks.
 
-    The answer must be stable by the count of `eliminate` there; a start that is the answer, if it is not `certified` already. Factors of an earlier step would not do, however well they
-    serve for steps: the smallest eigenvalue changes by as much as the arm turns.
+    The answer must be stable by the count of `eliminate` there; not so a start that is the answer and `certified` already.
+    Factors of an earlier step would not do, however well they serve for steps: the smallest eigenvalue changes by as much as
+    the arm turns.
 
     The tangent is factorised for every KEPT-th step of all arms. In between a step with old factors gains almost as much as
     one with new ones, at a third of the cost; an arm for which it would not waits. An arm that is done, or lost, keeps its
@@ -874,8 +882,8 @@ def follow(f, i, a, w, budget, first):
     """Follow the branch of equilibria of one arm, in all places of the packs, from FROM_DRIVE to TO_DRIVE, loads likewise.
 
     Newton over `first`, a share of the way, to begin with; its first step is the tangent's prediction. Where it fails, in
-    substeps, shortened on failure and doubled on success, for at most `budget` iterations. In: the equilibrium where the way begins, at
-    STRAIN. Out: that where it ends; FROM_DRIVE and FROM_LOADS, where that is; OUTCOME: rung (SUBSTEPS or FAILED),
+    substeps, shortened on failure and doubled on success, for at most `budget` iterations. In: the equilibrium where the way
+    begins, at STRAIN. Out: that where it ends; FROM_DRIVE and FROM_LOADS, where that is; OUTCOME: rung (SUBSTEPS or FAILED),
     residual, Newton iterations in all, next substep as a share of what is left of the way, largest SLOWNESS.
     """
     strains, muscles = 6 * i[NODES], i[MUSCLES]
@@ -963,7 +971,11 @@ def heat(f, i, a, w, n, _):
     for row in range(n * PACK, min(n * PACK + PACK, a[COUNT])):
         for k in range(heated):
             at = row * heated + k
-            kept, loss, ambient = constants[KEPT_SHARE * heated + k], constants[LOSS * heated + k], constants[AMBIENT_AT * heated + k]
+            kept, loss, ambient = (
+                constants[KEPT_SHARE * heated + k],
+                constants[LOSS * heated + k],
+                constants[AMBIENT_AT * heated + k],
+            )
             asked = 0.5 * (min(max(action[at], -1.0), 1.0) + 1.0) * constants[MAX_POWER * heated + k]
             end = (constants[LIMIT_AT * heated + k] - kept * temperature[at]) / constants[LOST_SHARE * heated + k]
             given = min(asked, max(loss * (end - ambient), 0.0))
@@ -973,7 +985,7 @@ def heat(f, i, a, w, n, _):
 
 
 def lanes(f, i, a, w, n, first):
-    """Solve the lanes of pack `n` of the arrays of `collocation.solve_lanes`, those of a pack at a time, and stragglers alone."""
+    """Solve the lanes of pack `n` of the arrays of `collocation.solve_lanes`: together, and stragglers one by one."""
     strains, muscles, count, drives = 6 * i[NODES], i[MUSCLES], a[COUNT], a[HEATED]
     y = floats_of(w)
     strain, tension, report = floats_at(a[AT_STRAIN]), floats_at(a[AT_TENSION]), floats_at(a[AT_REPORT])

@@ -21,8 +21,9 @@ STEP_S = 0.1
 CUT_OFF = HARD_LIMIT - 2.0
 """Temperature [degC] that the heaters' firmware never lets a TCA exceed."""
 
-RAMP = 3
-"""Steps in which `Core.settle` heats; with fewer, the solver more often doubts that it is on the branch that it began on."""
+RAMP = (0.33, 0.67, 0.99, 1.0)
+"""Shares of the way in which `Core.settle` heats: with fewer, the solver more often doubts that it is on the branch that it
+began on; the last one is short, so that what is left of Newton's residual is little."""
 
 
 @dataclass
@@ -193,7 +194,7 @@ class Core:
         record = self.rest.rows(np.zeros(lanes, dtype=np.intp))
         if payload is not None:
             record.payload[:] = payload
-        for done in np.arange(1, RAMP + 1) / RAMP:
+        for done in RAMP:
             report = self._solve(record, self.heating.ambient + done * (target - self.heating.ambient))
             good &= solved(report) & (report[:, 3] == 0.0)
         return record, good
