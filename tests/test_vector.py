@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 import tca_envs  # noqa: F401
-from tca_envs.mechanics import collocation, grasp
+from tca_envs.mechanics import grasp, kernels
 from tca_envs.tasks import core
 from tca_envs.tasks.reach import Reach
 from tca_envs.vector import ArmVectorEnv
@@ -68,7 +68,7 @@ def failing(monkeypatch):
         bad = asked[:, 0] > 50.0
         for values, kept in zip(state, before, strict=True):
             values[bad] = kept[bad]
-        report[bad] = (collocation.FAILED, 1.0, 7, 0, 0)
+        report[bad] = (kernels.FAILED, 1.0, 7, 0, 0)
 
     def draw(task, core, generators):
         return np.array([generator.random(3) for generator in generators]), np.empty((len(generators), 0))

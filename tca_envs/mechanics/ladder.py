@@ -13,24 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs.mechanics.collocation import (
-    DESCENT,
-    FAILED,
-    FINER,
-    GIVEN,
-    INERTIA,
-    NEUTRAL,
-    REPORT,
-    SMALLEST_SUBSTEP,
-    STEP,
-    SUBSTEPS,
-    WARM,
-    Heat,
-    Model,
-    addresses,
-    linearise,
-    solve_lanes,
-)
+from tca_envs.mechanics.collocation import GIVEN, INERTIA, STEP, Heat, Model, addresses, linearise, solve_lanes
+from tca_envs.mechanics.kernels import DESCENT, FAILED, FINER, NEUTRAL, REPORT, SMALLEST_SUBSTEP, SUBSTEPS, WARM
 
 if TYPE_CHECKING:
     from tca_envs.mechanics.arm import Arm
@@ -343,6 +327,8 @@ def _pushed_off(model: Model, strain: Array, tension: Array, drive: Array, load:
         numbers, *_, bend, shear, _ = linearise(
             model, strain, tension.copy(), drive, load, damping, False, GIVEN, -stiffness * mode
         )
+        if not 0.0 < numbers[4] < np.inf:  # no tangent to speak of: off along what there is
+            break
         mode = np.hstack([bend, shear])
         mode *= NUDGE / numbers[4]
     return strain + mode

@@ -9,13 +9,16 @@ They are compiled once and called by address (`call_kernel`), or every caller wo
 """
 
 import operator
+from typing import Any
 
 from llvmlite import ir
-from numba import types
+from numba import extending, types
 from numba.core import cgutils
 from numba.core.datamodel import models
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, register_model
+from numba.extending import lower_builtin, register_model
+
+intrinsic: Any = extending.intrinsic
 
 PACK = 4
 """Arms in a pack."""

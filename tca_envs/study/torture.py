@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from tca_envs import presets
 from tca_envs.mechanics import Rung, ladder, thermal
-from tca_envs.mechanics.collocation import REPORT, SHAPE, Heat, linearise, solve_lanes
+from tca_envs.mechanics.collocation import SHAPE, Heat, linearise, solve_lanes
+from tca_envs.mechanics.kernels import REPORT
 from tca_envs.mechanics.ladder import Lane
 from tca_envs.study import output
 from tca_envs.study.scenes import IDS
@@ -190,7 +191,11 @@ class Watched(Core):
             rows = slice(lane, lane + 1)
             one = Record(*(getattr(record, f.name)[rows] for f in fields(Record)))
             start = one.drive[0].copy()
-            warmth = None if heat is None else Heat(*(values[rows] for values in heat[:3]), heat.constants)
+            warmth = (
+                None
+                if heat is None
+                else heat._replace(action=heat.action[rows], temperature=heat.temperature[rows], power=heat.power[rows])
+            )
             wall, cpu = time.perf_counter_ns(), time.thread_time_ns()
             report = super()._solve(one, temperature[rows], warmth)
             cpu, wall = time.thread_time_ns() - cpu, time.perf_counter_ns() - wall

@@ -40,7 +40,7 @@ from tca_envs.mechanics.algebra import (
     scalar_matrix,
     transpose,
 )
-from tca_envs.mechanics.collocation import PAYLOAD_MASS
+from tca_envs.mechanics.kernels import PAYLOAD_MASS
 
 Array = NDArray[np.float64]
 

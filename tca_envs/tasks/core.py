@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tca_envs.mechanics import Arm, ladder, thermal
-from tca_envs.mechanics.collocation import FAILED, LOAD, PAYLOAD_MASS, REPORT, Heat
+from tca_envs.mechanics.collocation import Heat
+from tca_envs.mechanics.kernels import FAILED, LOAD, PAYLOAD_MASS, REPORT
 from tca_envs.mechanics.thermal import HARD_LIMIT, Heater
 
 Array = NDArray[np.float64]
