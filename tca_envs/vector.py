@@ -19,6 +19,7 @@ from tca_envs.tasks.core import solved
 Lanes = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
+NO_LANES = np.empty(0, dtype=np.intp)
 FOR_ALL = ("compute_reward", "task", "reward", "arm", "render_mode", "spec")
 """What `call` and `get_attr` find that is the same for all lanes, beside the spaces."""
 
@@ -134,27 +135,28 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         ResetNeeded
             Before the first reset, and with autoreset disabled if an episode is over.
         """
-        mode = self.metadata["autoreset_mode"]
+        mode, over = self.metadata["autoreset_mode"], self._over
         if not self._ready:
             raise ResetNeeded("cannot step before the first reset")
-        if mode is AutoresetMode.DISABLED and self._over.any():
-            raise ResetNeeded(f"episodes are over in lanes {np.flatnonzero(self._over).tolist()}: reset those")
-        anew = self._over if mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._over)
+        if mode is AutoresetMode.DISABLED and over.any():
+            raise ResetNeeded(f"episodes are over in lanes {np.flatnonzero(over).tolist()}: reset those")
+        anew = np.flatnonzero(over) if mode is AutoresetMode.NEXT_STEP else NO_LANES
         command = self._checked_actions(actions, anew)
-        if anew.any():  # they rest meanwhile, where a step costs next to nothing and cannot fail
-            self.core.reset(np.flatnonzero(anew), 0.0, 0.0)
+        if anew.size:  # they rest meanwhile, where a step costs next to nothing and cannot fail
+            self.core.reset(anew, 0.0, 0.0)
         report = self.task.step(self.core, command)
         self._elapsed += 1
         truncated = ~solved(report)
         if self.max_episode_steps is not None:
             truncated |= self._elapsed >= self.max_episode_steps
-        if anew.any():
-            self._start(np.flatnonzero(anew))
+        if anew.size:
+            self._start(anew)
             report[anew] = self.core.rest_report
-            truncated &= ~anew
+            truncated[anew] = False
         observation, outcome = batch.look(self.task, self.core)
         reward = batch.rewards(self.reward, outcome)
-        reward[anew] = 0.0
+        if anew.size:
+            reward[anew] = 0.0
         info = batch.infos(self.core.record, outcome, report)
         final: dict[str, Any] = {}
         if mode is AutoresetMode.SAME_STEP and truncated.any():
@@ -164,13 +166,14 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
                 "final_info": _with_masks(info, truncated),
                 "_final_info": truncated.copy(),
             }
-            self._start(np.flatnonzero(truncated))
-            report[truncated] = self.core.rest_report
+            ended = np.flatnonzero(truncated)
+            self._start(ended)
+            report[ended] = self.core.rest_report
             observation, outcome = batch.look(self.task, self.core)
             info = batch.infos(self.core.record, outcome, report)
         self._over = truncated.copy()
-        all_lanes = np.ones(self.num_envs, dtype=np.bool_)
-        return observation, reward, np.zeros_like(truncated), truncated, {**_with_masks(info, all_lanes), **final}
+        infos = {**_with_masks(info, np.ones(self.num_envs, dtype=np.bool_)), **final}
+        return observation, reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, infos
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
         """Return the reward of a goal (k,) as a float, or of a batch (..., k) as an array (...,); `info` is not read."""
@@ -276,11 +279,12 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             self._generators[lane] = found
         return found
 
-    def _checked_actions(self, actions: Any, ignored: Mask) -> NDArray[np.float64]:
+    def _checked_actions(self, actions: Any, ignored: Lanes) -> NDArray[np.float64]:
         """Return actions (N, a), in lanes that are ignored those that leave the heaters off."""
         shape = (self.num_envs, self.task.actions)
-        if ignored.any() and np.shape(actions) == shape:
-            actions = np.where(ignored[:, np.newaxis], -1.0, actions)
+        if ignored.size and np.shape(actions) == shape:
+            actions = np.array(actions)
+            actions[ignored] = -1.0
         return batch.checked_actions("actions", actions, shape)
 
     def _checked_seeds(self, seed: Any) -> list[int | None]:
@@ -321,12 +325,15 @@ def _rows(observation: Observation, mask: Mask) -> NDArray[np.object_]:
 
 
 def _with_masks(info: Mapping[str, Any], mask: Mask) -> dict[str, Any]:
-    """Return infos with zeros in lanes that have none, and a mask of those that have beside each key, as Gymnasium does."""
+    """Return infos, zero in lanes that have none, and beside each key a mask of those that have; nothing of it is shared."""
+    without = np.flatnonzero(~mask)
     result: dict[str, Any] = {}
     for key, value in info.items():
         if isinstance(value, dict):
             result[key] = _with_masks(value, mask)
         else:
-            result[key] = np.where(mask, value, np.zeros((), dtype=value.dtype))
+            result[key] = value.copy()
+            if without.size:
+                result[key][without] = 0
         result[f"_{key}"] = mask.copy()
     return result

@@ -152,7 +152,7 @@ def observed(core: Core, count: int) -> Single:
 
 def distance(achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
     """Return the distance of the first three coordinates over the last axis, in double precision."""
-    apart = np.subtract(achieved[..., :3], desired[..., :3], dtype=np.float64)
+    apart = achieved.astype(np.float64) - desired
     x, y, z = apart[..., 0], apart[..., 1], apart[..., 2]
     return np.asarray(np.sqrt(x * x + y * y + z * z))
 
