@@ -248,3 +248,11 @@ def test_a_broken_checkpoint_is_told(tmp_path, capsys):
     with pytest.raises(SystemExit):
         train.main(["--eval-only", str(folder)])
     assert "expected a sac policy" in capsys.readouterr().err
+
+
+def test_a_run_without_a_checkpoint_is_told(tmp_path, capsys):
+    (tmp_path / "policy.json").write_text('{"task": "reach", "algo": "sac"}')
+    with pytest.raises(SystemExit) as stop:
+        train.main(["--resume", str(tmp_path)])
+    assert stop.value.code == 2
+    assert "last.zip: not there; a run that ended before its first checkpoint" in capsys.readouterr().err
