@@ -4,6 +4,7 @@ python train.py [--task reach] [--algo sac] [--steps N] [--seed S]      train an
 python train.py --resume runs/reach-sac-seed0                           go on with a run
 python train.py --eval-only runs/reach-sac-seed0                        evaluate a run
 python train.py --eval-only pretrained [--task reach]                   evaluate the policy that comes along
+python train.py --tune 30 [--task reach] [--algo ppo]                   search for better settings
 python train.py --benchmark [--seeds 0 1 2] [--jobs 2]                  all algorithms on all tasks: table and learning curves
 """
 
@@ -70,6 +71,13 @@ def main(arguments: list[str] | None = None) -> int:
     import torch
 
     torch.set_num_threads(options.threads)
+    if options.tune is not None:
+        if find_spec("optuna") is None:
+            fail("--tune needs Optuna, which is in the extra `tune`: pip install -e '.[train,tune]'")
+        from agents.tuning import tune
+
+        tune(task, algorithm, settings, options.tune, options, options.out or Path("runs") / f"tune-{task}-{algorithm}")
+        return 0
     if options.resume:
         model = load(options.resume / "last.zip", algorithm, settings, options)
         buffer = options.resume / "replay_buffer.pkl"
@@ -125,6 +133,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         help='evaluate the run in this folder; "pretrained" is what comes along for the task',
     )
     parser.add_argument("--resume", type=Path, metavar="PATH", help="go on with the run in this folder")
+    parser.add_argument("--tune", type=int, metavar="N", help="search for better settings in N trials, with --steps each")
     parser.add_argument(
         "--benchmark",
         action="store_true",
@@ -141,15 +150,16 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         fail(f"--task {options.task}: unknown; the tasks are {', '.join(HYPERPARAMETERS)}")
     if options.algo is not None and options.algo not in ALGORITHMS:
         fail(f"--algo {options.algo}: unknown; the algorithms are {', '.join(ALGORITHMS)}")
-    for name in ("steps", "episodes", "threads", "jobs"):
+    for name in ("steps", "episodes", "threads", "jobs", "tune"):
         value = getattr(options, name)
         if value is not None and value < 1:
             fail(f"--{name} {value}: expected a positive integer")
     for name, value in (("seed", options.seed), *(("seeds", value) for value in options.seeds)):
         if value < 0:
             fail(f"--{name} {value}: expected an integer of at least 0")
-    if options.eval_only is not None and options.resume is not None:
-        fail("--eval-only and --resume exclude each other")
+    chosen = [name for name in ("eval_only", "resume", "tune", "benchmark") if getattr(options, name)]
+    if len(chosen) > 1:
+        fail(f"{' and '.join('--' + name.replace('_', '-') for name in chosen)} exclude each other")
     return options
 
 
