@@ -187,12 +187,13 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 def learner(algorithm: str) -> Any:
-    """Return the class of an algorithm: Stable-Baselines3's or our own in its form."""
+    """Return the class of an algorithm: Stable-Baselines3's, or our own in its form. HER is SAC with another buffer."""
     import stable_baselines3
 
     from agents.dagger import DAgger
 
-    return DAgger if algorithm == "dagger" else getattr(stable_baselines3, algorithm.upper())
+    own = {"dagger": DAgger, "her": stable_baselines3.SAC}
+    return own[algorithm] if algorithm in own else getattr(stable_baselines3, algorithm.upper())
 
 
 def environments(settings: dict[str, Any], seed: int) -> Any:
