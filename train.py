@@ -220,6 +220,8 @@ def build(algorithm: str, settings: dict[str, Any], options: argparse.Namespace)
 
 def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse.Namespace) -> Any:
     """Return a saved model; prints a message and exits with 2 if it is none or was made for other spaces."""
+    if not path.exists():
+        fail(f"{path}: not there; a run that ended before its first checkpoint has to start again")
     try:
         model = learner(algorithm).load(path, device=options.device)
     except Exception as error:  # SB3 passes on whatever torch, pickle and zipfile raise

@@ -162,7 +162,7 @@ def test_dagger_imitates_the_controller_and_goes_on_with_its_record(quickly, tmp
 def test_a_fresh_run_leaves_nothing_of_an_earlier_one(tmp_path, monkeypatch):
     folder = tmp_path / "again"
     folder.mkdir()
-    for name in train.ARTEFACTS:
+    for name in ("policy.zip", "last.zip", "replay_buffer.pkl", "curve.csv", "report.json", "events.out.tfevents.17.host.3.0"):
         (folder / name).write_text("old")
     monkeypatch.setattr(train, "train", lambda *arguments: (0.0, True))
     assert train.main(["--out", str(folder)]) == 130
@@ -248,3 +248,11 @@ def test_a_broken_checkpoint_is_told(tmp_path, capsys):
     with pytest.raises(SystemExit):
         train.main(["--eval-only", str(folder)])
     assert "expected a sac policy" in capsys.readouterr().err
+
+
+def test_a_run_without_a_checkpoint_is_told(tmp_path, capsys):
+    (tmp_path / "policy.json").write_text('{"task": "reach", "algo": "sac"}')
+    with pytest.raises(SystemExit) as stop:
+        train.main(["--resume", str(tmp_path)])
+    assert stop.value.code == 2
+    assert "last.zip: not there; a run that ended before its first checkpoint" in capsys.readouterr().err
