@@ -65,8 +65,6 @@ def main(arguments: list[str] | None = None) -> int:
         options.seed = description.get("seed", options.seed)
     task = task or "reach"
     algorithm = algorithm or DEFAULT_ALGORITHM[task]
-    if algorithm not in HYPERPARAMETERS[task]:
-        fail(f"--algo {algorithm}: not for the task {task!r}, whose algorithms are {', '.join(HYPERPARAMETERS[task])}")
     settings = dict(HYPERPARAMETERS[task][algorithm])
     import torch
 
