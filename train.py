@@ -65,8 +65,6 @@ def main(arguments: list[str] | None = None) -> int:
         options.seed = description.get("seed", options.seed)
     task = task or "reach"
     algorithm = algorithm or DEFAULT_ALGORITHM[task]
-    if algorithm not in HYPERPARAMETERS[task]:
-        fail(f"--algo {algorithm}: not for the task {task!r}, whose algorithms are {', '.join(HYPERPARAMETERS[task])}")
     settings = dict(HYPERPARAMETERS[task][algorithm])
     import torch
 
@@ -187,12 +185,13 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 def learner(algorithm: str) -> Any:
-    """Return the class of an algorithm: Stable-Baselines3's or our own in its form."""
+    """Return the class of an algorithm: Stable-Baselines3's, or our own in its form. HER is SAC with another buffer."""
     import stable_baselines3
 
     from agents.dagger import DAgger
 
-    return DAgger if algorithm == "dagger" else getattr(stable_baselines3, algorithm.upper())
+    own = {"dagger": DAgger, "her": stable_baselines3.SAC}
+    return own[algorithm] if algorithm in own else getattr(stable_baselines3, algorithm.upper())
 
 
 def environments(settings: dict[str, Any], seed: int) -> Any:
