@@ -3,31 +3,34 @@
 python train.py [--task reach] [--algo sac] [--steps N] [--seed S]      train and evaluate
 python train.py --resume runs/reach-sac-seed0                           go on with a run
 python train.py --eval-only runs/reach-sac-seed0                        evaluate a run
+python train.py --eval-only pretrained [--task reach]                   evaluate the policy that comes along
 """
 
 import argparse
-import csv
 import json
 import platform
 import sys
-import time
 from dataclasses import asdict
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
 import gymnasium
 
 import tca_envs  # noqa: F401  (registers the environments)
-from agents.evaluate import Policy, Report, evaluate
+from agents.evaluate import Policy, Report, evaluate, lanes_for
 from agents.hyperparameters import ALGORITHMS, DEFAULT_ALGORITHM, HYPERPARAMETERS
 from agents.scripted import CONTROLLERS, RandomPolicy
 
 EVALUATION_SEED = 1_000_000
 """Held-out goals are drawn with seeds from here on."""
+PRETRAINED = Path(__file__).parent / "agents" / "pretrained"
 ARTEFACTS = (
     "policy.zip", "policy.json", "last.zip", "replay_buffer.pkl", "curve.csv", "curve.png", "report.json", "evaluation.json",
+    "events.out.tfevents.*",
 )  # fmt: skip
+"""What a run leaves in its folder, as patterns."""
 CURVE_SEED = 2_000_000
 """Goals of the learning curve, of the training split, are drawn with seeds from here on."""
 CURVE_EPISODES = 30
@@ -39,6 +42,8 @@ CURVE_INTERVAL = 2_000
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     options = parse(arguments)
+    if options.eval_only == Path("pretrained"):
+        options.eval_only = PRETRAINED / (options.task or "reach")
     source = options.eval_only or options.resume
     task, algorithm = options.task, options.algo
     if source is not None:
@@ -72,8 +77,8 @@ def main(arguments: list[str] | None = None) -> int:
     if not options.eval_only:
         folder.mkdir(parents=True, exist_ok=True)
         if not options.resume:
-            for name in ARTEFACTS:  # of an earlier run in the same folder
-                (folder / name).unlink(missing_ok=True)
+            for path in [path for pattern in ARTEFACTS for path in folder.glob(pattern)]:
+                path.unlink()  # of an earlier run in the same folder
         seconds, interrupted = train(model, task, algorithm, settings, options, folder)
         print(f"saved the policy, curve.csv and curve.png in {folder}")
         if interrupted:
@@ -103,10 +108,20 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Train and evaluate policies on the TCA arm.")
     parser.add_argument("--task", help=f"one of {', '.join(HYPERPARAMETERS)} (default: reach)")
     parser.add_argument("--algo", help=f"one of {', '.join(ALGORITHMS)} (default: the task's best)")
-    parser.add_argument("--steps", type=int, help="environment steps to train, with --resume in addition (default: the task's)")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        help="environment steps to train, with --resume in addition (default: what is missing to a run that was cut short, "
+        "else the task's)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
     parser.add_argument("--out", type=Path, help="folder of the run (default: runs/TASK-ALGO-seedS)")
-    parser.add_argument("--eval-only", type=Path, metavar="PATH", help="evaluate the run in this folder")
+    parser.add_argument(
+        "--eval-only",
+        type=Path,
+        metavar="PATH",
+        help='evaluate the run in this folder; "pretrained" is what comes along for the task',
+    )
     parser.add_argument("--resume", type=Path, metavar="PATH", help="go on with the run in this folder")
     parser.add_argument("--episodes", type=int, default=200, help="held-out episodes to evaluate (default: 200)")
     parser.add_argument("--threads", type=int, default=1, help="threads of torch (default: 1: the networks are small)")
@@ -160,18 +175,12 @@ def learner(algorithm: str) -> Any:
 
 
 def environments(settings: dict[str, Any], seed: int) -> Any:
-    """Return the vector of training environments."""
-    from stable_baselines3.common.env_util import make_vec_env
+    """Return the batch of training environments."""
+    from stable_baselines3.common.vec_env import VecMonitor
 
-    def make() -> gymnasium.Env[Any, Any]:
-        env = gymnasium.make(settings["env"])
-        if "done_steps" not in settings:
-            return env
-        from agents.dagger import EndWhenDone
+    from agents.sb3 import make
 
-        return EndWhenDone(env, settings["done_steps"])
-
-    return make_vec_env(make, n_envs=settings["envs"], seed=seed)
+    return VecMonitor(make(settings["env"], settings["envs"], seed, settings.get("done_steps")))
 
 
 def build(algorithm: str, settings: dict[str, Any], options: argparse.Namespace) -> Any:
@@ -184,11 +193,14 @@ def build(algorithm: str, settings: dict[str, Any], options: argparse.Namespace)
 
 def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse.Namespace) -> Any:
     """Return a saved model; prints a message and exits with 2 if it is none or was made for other spaces."""
+    if not path.exists():
+        fail(f"{path}: not there; a run that ended before its first checkpoint has to start again")
     try:
         model = learner(algorithm).load(path, device=options.device)
     except Exception as error:  # SB3 passes on whatever torch, pickle and zipfile raise
         fail(f"{path}: expected a {algorithm} policy that this version of stable-baselines3 reads ({error})")
-    env = environments(settings, options.seed + model.num_timesteps)  # goals go on, not again
+    # As many as it was trained with; goals go on, not again.
+    env = environments({**settings, "envs": model.n_envs}, options.seed + model.num_timesteps)
     for name in ("observation_space", "action_space"):
         if getattr(model, name) != getattr(env, name):
             fail(f"{path}: made for the {name} {getattr(model, name)}, but {settings['env']} has {getattr(env, name)}")
@@ -204,113 +216,45 @@ def train(
     The policy kept is the one that came nearest to the curve's goals; they are of the training split, so that the held-out
     goals stay unseen until the end.
     """
-    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.logger import configure
 
-    steps = options.steps or settings["steps"]
-    interval = max(CURVE_INTERVAL, steps // CURVE_POINTS)
-    env = gymnasium.make(settings["env"])
-    curve = read_curve(folder) if options.resume else []
-    begun = time.monotonic() - (curve[-1]["seconds"] if curve else 0.0)
+    from agents.curve import Curve
 
-    class Curve(BaseCallback):
-        """Evaluate now and then, and keep the policy that did best."""
-
-        due = model.num_timesteps + interval
-
-        def _on_step(self) -> bool:
-            if self.num_timesteps >= self.due:
-                self.due += interval
-                self.add_point()
-            return True
-
-        def _on_training_end(self) -> None:
-            if not curve or curve[-1]["steps"] < self.num_timesteps:
-                self.add_point()
-
-        def add_point(self) -> None:
-            report = evaluate(self.model, env, CURVE_EPISODES, CURVE_SEED)
-            curve.append(
-                {
-                    "steps": self.num_timesteps,
-                    "seconds": round(time.monotonic() - begun, 1),
-                    "success_rate": report.success_rate,
-                    "final_distance_mm": report.final_distance_mm,
-                    "episode_return": report.episode_return,
-                }
-            )
-            save_curve(curve, folder)
-            if curve[-1] is min(curve, key=lambda row: row["final_distance_mm"]):
-                self.model.save(folder / "policy.zip")
-
+    left = read_description(folder).get("steps", 0) - model.num_timesteps if options.resume else 0
+    steps = options.steps or (left if left > 0 else settings["steps"])
     print(f"training {algorithm} on {settings['env']} for {steps} steps, seed {options.seed}, into {folder}")
     description = {
         "task": task,
         "algo": algorithm,
         "seed": options.seed,
         "env": settings["env"],
+        "steps": model.num_timesteps + steps,
         "versions": versions(),
     }
     (folder / "policy.json").write_text(json.dumps(description, indent=2) + "\n")
+    model.set_logger(configure(str(folder), ["tensorboard"] if find_spec("tensorboard") else []))
+    curve = Curve(
+        folder,
+        gymnasium.make_vec(settings["env"], CURVE_EPISODES),
+        CURVE_EPISODES,
+        CURVE_SEED,
+        max(CURVE_INTERVAL, steps // CURVE_POINTS),
+        resume=options.resume is not None,
+    )
     interrupted = False
     try:
-        model.learn(steps, callback=Curve(), reset_num_timesteps=False, progress_bar=True)
+        model.learn(steps, callback=curve, reset_num_timesteps=False, progress_bar=True)
     except KeyboardInterrupt:
         interrupted = True
-    seconds = time.monotonic() - begun
-    model.save(folder / "last.zip")
-    if not (folder / "policy.zip").exists():
-        model.save(folder / "policy.zip")
-    if hasattr(model, "save_replay_buffer"):
-        model.save_replay_buffer(folder / "replay_buffer.pkl")
-    save_curve(curve, folder)
-    return seconds, interrupted
-
-
-CURVE_COLUMNS = ("steps", "seconds", "success_rate", "final_distance_mm", "episode_return")
-
-
-def read_curve(folder: Path) -> list[dict[str, float]]:
-    """Return the learning curve of a run, empty if it has none."""
-    path = folder / "curve.csv"
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
-
-
-def save_curve(curve: list[dict[str, float]], folder: Path) -> None:
-    """Write the learning curve as curve.csv and curve.png."""
-    with (folder / "curve.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, CURVE_COLUMNS)
-        writer.writeheader()
-        writer.writerows(curve)
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    from matplotlib.ticker import LogLocator
-
-    figure, (top, bottom) = plt.subplots(2, 1, sharex=True, figsize=(6.0, 5.0), layout="constrained")
-    steps = [row["steps"] / 1000.0 for row in curve]
-    top.plot(steps, [100.0 * row["success_rate"] for row in curve], "o-", ms=3)
-    top.set(ylabel="success rate [%]", ylim=(-3, 103), title=f"{folder.name}: {CURVE_EPISODES} episodes per point")
-    bottom.semilogy(steps, [row["final_distance_mm"] for row in curve], "o-", ms=3, color="tab:orange")
-    bottom.set(xlabel="environment steps [thousands]", ylabel="mean final distance [mm]")
-    bottom.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
-    for axis_format in (bottom.yaxis.set_major_formatter, bottom.yaxis.set_minor_formatter):
-        axis_format("{x:g}")
-    for axes in (top, bottom):
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(folder / "curve.png", dpi=150)
-    plt.close(figure)
+        curve.save()
+    return curve.seconds, interrupted
 
 
 def compare(model: Any, task: str, algorithm: str, settings: dict[str, Any], episodes: int) -> dict[str, Report]:
     """Return the reports of the policy, the scripted controller and a random policy on the same held-out goals."""
     from tqdm import tqdm
 
-    env = gymnasium.make(settings["env"], split="held-out")
+    env = gymnasium.make_vec(settings["env"], lanes_for(episodes), split="held-out")
     policies: dict[str, Policy] = {
         algorithm: model,
         "scripted": CONTROLLERS[task](),
@@ -319,7 +263,7 @@ def compare(model: Any, task: str, algorithm: str, settings: dict[str, Any], epi
     reports = {}
     for name, policy in policies.items():
         with tqdm(total=episodes, desc=f"{name} on held-out goals", leave=False) as bar:
-            reports[name] = evaluate(policy, env, episodes, EVALUATION_SEED, lambda _: bar.update())
+            reports[name] = evaluate(policy, env, episodes, EVALUATION_SEED, lambda done: bar.update(done - bar.n))
     for name, report in reports.items():
         print(f"{name:>9}: {report}")
     return reports

@@ -9,7 +9,6 @@ import pickle
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -22,34 +21,6 @@ from agents.scripted import CONTROLLERS
 EXPERT_STEPS = 30_000
 """Steps that the controller drives before the policy takes over."""
 Observations = dict[str, NDArray[np.float32]]
-
-
-class EndWhenDone(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """End an episode when its goal has been held for some steps: what comes then teaches nothing new.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        Its info has `is_success`.
-    steps : int
-        How long.
-    """
-
-    def __init__(self, env: gymnasium.Env[Any, Any], steps: int) -> None:
-        super().__init__(env)
-        self.steps = steps
-        self.held = 0
-
-    def reset(self, **options: Any) -> Any:
-        """Reset the environment."""
-        self.held = 0
-        return self.env.reset(**options)
-
-    def step(self, action: Any) -> Any:
-        """Step the environment."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self.held = self.held + 1 if info["is_success"] else 0
-        return observation, reward, terminated, truncated or self.held >= self.steps, info
 
 
 class DAgger(PPO):
@@ -107,18 +78,18 @@ class DAgger(PPO):
         if self.controller is None:
             raise ValueError(f"controller = None: expected one of {', '.join(map(repr, CONTROLLERS))} to learn from")
         assert self.env is not None
-        experts = [CONTROLLERS[self.controller]() for _ in range(self.env.num_envs)]
+        expert = CONTROLLERS[self.controller]()
         callbacks.on_training_start(locals(), globals())
         observation: Any = self._last_obs
         going_on = True
         while going_on and self.num_timesteps < total_timesteps:
             by_expert = self.num_timesteps < EXPERT_STEPS
             for _ in range(self.n_steps):
-                lanes = [{key: value[i] for key, value in observation.items()} for i in range(len(experts))]
-                wanted = np.array([expert.predict(lane)[0] for expert, lane in zip(experts, lanes, strict=True)])
+                wanted, _ = expert.predict(observation)
                 self.record.append(({key: value.copy() for key, value in observation.items()}, wanted))
                 action = wanted if by_expert else self.predict(observation, deterministic=True)[0]
-                observation, _, _, _ = self.env.step(action)
+                observation, _, dones, infos = self.env.step(action)
+                self._update_info_buffer(infos, dones)
                 self._last_obs = observation
                 self.num_timesteps += self.env.num_envs
                 going_on = callbacks.on_step()
@@ -126,6 +97,7 @@ class DAgger(PPO):
                     break
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
             self._fit()
+            self.dump_logs()
         callbacks.on_training_end()
         return self
 
@@ -146,3 +118,4 @@ class DAgger(PPO):
                 torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
                 self.policy.optimizer.step()
         self.policy.set_training_mode(False)
+        self.logger.record("train/loss", loss.item())

@@ -7,15 +7,19 @@ from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from tca_envs.tasks.core import STEP_S
+
+MOST_LANES = 250
+"""Episodes that are run at once."""
 
 
 class Policy(Protocol):
     """What is evaluated: an SB3 model or a scripted controller."""
 
     def predict(self, observation: Any, state: Any = ..., episode_start: Any = ..., deterministic: bool = ...) -> Any:
-        """Return (action, state)."""
+        """Return (actions, state)."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +62,15 @@ def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, flo
     return 0.0 if successes == 0 else centre - half, 1.0 if successes == trials else centre + half
 
 
+def lanes_for(episodes: int) -> int:
+    """Return how many lanes run `episodes` in as few rounds as MOST_LANES allows, with as few idle ones."""
+    rounds = -(-episodes // MOST_LANES)
+    return -(-episodes // rounds)
+
+
 def evaluate(
     policy: Policy,
-    env: gymnasium.Env[Any, Any],
+    env: VectorEnv[Any, Any, Any] | gymnasium.Env[Any, Any],
     episodes: int,
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
@@ -70,11 +80,12 @@ def evaluate(
     Parameters
     ----------
     policy : Policy
-        Has `predict(observation, deterministic=True)`.
-    env : gymnasium.Env
-        One environment with its time limit.
+        Has `predict(observation, deterministic=True)`, for a batch of observations.
+    env : gymnasium.vector.VectorEnv or gymnasium.Env
+        Environments with their time limit, in the autoreset mode NEXT_STEP, `gymnasium.make_vec`'s own; a single one is a batch
+        of one.
     episodes : int
-        How many; episode i is seeded with `seed` + i, so that every policy meets the same goals.
+        How many; episode i is seeded with `seed` + i, so that every policy meets the same goals, whatever the batch.
     seed : int
         First seed.
     progress : callable, optional
@@ -87,41 +98,49 @@ def evaluate(
     Raises
     ------
     ValueError
-        If `episodes` is not a positive integer.
+        If `episodes` is not a positive integer or the environments restart in another way.
     """
     if not isinstance(episodes, int) or episodes < 1:
         raise ValueError(f"episodes = {episodes!r}: expected a positive integer")
-    successes = failures = 0
-    distances, energies, returns, times = [], [], [], []
-    for episode in range(episodes):
-        observation, info = env.reset(seed=seed + episode)
-        total, steps, held_since, over = 0.0, 0, 0, False
-        while not over:
+    if isinstance(env, gymnasium.Env):
+        single = env
+        env = SyncVectorEnv([lambda: single])
+    if env.metadata["autoreset_mode"] != AutoresetMode.NEXT_STEP:
+        raise ValueError(f"env has autoreset_mode {env.metadata['autoreset_mode']}: expected {AutoresetMode.NEXT_STEP}")
+    lanes = env.num_envs
+    held = np.zeros(episodes, dtype=bool)
+    converged = np.zeros(episodes, dtype=bool)
+    held_since = np.zeros(episodes, dtype=int)
+    distance, energy, total = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
+    done = 0
+    for first in range(0, episodes, lanes):
+        seeds = [seed + first + lane for lane in range(lanes)]
+        observation, _ = env.reset(seed=seeds)  # type: ignore[arg-type]  # lists are fine
+        running, steps = np.arange(min(lanes, episodes - first)), 0
+        while running.size:
             action, _ = policy.predict(observation, deterministic=True)
             observation, reward, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
-            total += float(reward)
             steps += 1
-            if not info["is_success"]:
-                held_since = steps + 1
-        converged = info["solver"]["converged"]
-        successes += info["is_success"] and converged
-        failures += not converged
-        if info["is_success"] and converged:
-            times.append(held_since * STEP_S)
-        distances.append(info["distance_mm"])
-        energies.append(info["energy_J"])
-        returns.append(total)
-        if progress is not None:
-            progress(episode + 1)
+            total[first + running] += reward[running]
+            held_since[first + running[~info["is_success"][running]]] = steps + 1
+            over = (terminated | truncated)[running]
+            ended, running = running[over], running[~over]
+            held[first + ended] = info["is_success"][ended]
+            converged[first + ended] = info["solver"]["converged"][ended]
+            distance[first + ended] = info["distance_mm"][ended]
+            energy[first + ended] = info["energy_J"][ended]
+            done += ended.size
+            if progress is not None and ended.size:
+                progress(done)
+    success = held & converged
     return Report(
         episodes=episodes,
-        successes=successes,
-        success_rate=successes / episodes,
-        success_interval=wilson(successes, episodes),
-        final_distance_mm=float(np.mean(distances)),
-        time_to_success_s=float(np.mean(times)) if times else None,
-        energy_J=float(np.mean(energies)),
-        episode_return=float(np.mean(returns)),
-        solver_failures=failures,
+        successes=int(success.sum()),
+        success_rate=float(success.mean()),
+        success_interval=wilson(int(success.sum()), episodes),
+        final_distance_mm=float(distance.mean()),
+        time_to_success_s=float(np.mean(held_since[success] * STEP_S)) if success.any() else None,
+        energy_J=float(energy.mean()),
+        episode_return=float(total.mean()),
+        solver_failures=int((~converged).sum()),
     )

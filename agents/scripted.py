@@ -1,7 +1,7 @@
 """Controllers that solve the tasks from their observations, with the arm's model and no learning.
 
-They have the interface of a Stable-Baselines3 policy, `predict(observation) -> (action, None)`, so that everything that
-runs a trained policy runs them too.
+They have the interface of a Stable-Baselines3 policy, `predict(observation) -> (action, None)` for one observation or a batch,
+so that everything that runs a trained policy runs them too.
 """
 
 from abc import ABC, abstractmethod
@@ -50,6 +50,27 @@ LEAST_TURN = np.radians(5.0)
 """Of the yaws that fit, the first below this one needs the least heat [rad]."""
 
 
+class Lanes:
+    """A controller for each lane of a batch: what one remembers is none of another's business.
+
+    Parameters
+    ----------
+    controller : callable
+        Makes one.
+    """
+
+    def __init__(self, controller: "Callable[[], SteadyController | PickAndPlaceController]") -> None:
+        self.controller = controller
+        self.lanes: list[SteadyController | PickAndPlaceController] = []
+
+    def predict(self, observation: dict[str, NDArray[Any]]) -> tuple[NDArray[np.float32], None]:
+        """Return the actions (N, n) for a batch of observations."""
+        while len(self.lanes) < len(observation["desired_goal"]):
+            self.lanes.append(self.controller())
+        rows = [{key: value[i] for key, value in observation.items()} for i in range(len(observation["desired_goal"]))]
+        return np.array([lane.predict(row)[0] for lane, row in zip(self.lanes, rows, strict=False)]), None
+
+
 class SteadyController(ABC):
     """Plan the temperatures that put the tip on the goal, then drive each TCA there.
 
@@ -67,6 +88,7 @@ class SteadyController(ABC):
         self.heating = Heater().scaled(self.arm.rest_lengths)
         self.goal: Array | None = None
         self.target = np.full(len(self.arm.muscles), AMBIENT)
+        self.lanes = Lanes(type(self))
 
     def predict(
         self,
@@ -75,7 +97,12 @@ class SteadyController(ABC):
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """Return the action (n,) for an observation of the task; the other arguments are SB3's and not read."""
+        """Return the action (n,) for an observation of the task, or actions (N, n) for a batch of N.
+
+        Lane i of a batch remembers what it planned for lane i; the other arguments are SB3's and not read.
+        """
+        if np.ndim(observation["desired_goal"]) == 2:
+            return self.lanes.predict(observation)
         goal = np.asarray(observation["desired_goal"], dtype=np.float64)
         if self.goal is None or not np.array_equal(goal, self.goal):
             self.goal, self.target = goal, self.plan(goal)
@@ -135,6 +162,7 @@ class PickAndPlaceController:
         self.carrying = presets.whole_arm(payload=presets.with_object())
         self.heating = Heater().scaled(np.append(self.arm.rest_lengths, presets.gripper().rest_length))
         self.plans: dict[str, tuple[Array, Array]] = {}
+        self.lanes = Lanes(type(self))
 
     def predict(
         self,
@@ -143,7 +171,12 @@ class PickAndPlaceController:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """Return the action (6,) for an observation of TCAPickAndPlace; the other arguments are SB3's and not read."""
+        """Return the action (6,) for an observation of TCAPickAndPlace, or actions (N, 6) for a batch of N.
+
+        Lane i of a batch remembers what it planned for lane i; the other arguments are SB3's and not read.
+        """
+        if np.ndim(observation["desired_goal"]) == 2:
+            return self.lanes.predict(observation)
         scene = Sight.of(observation)
         phase = self.phase(scene)
         temperature = scene.temperature
@@ -418,8 +451,9 @@ class RandomPolicy:
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[NDArray[np.float32], None]:
-        """Return an action (size,); no argument is read."""
-        return self.rng.uniform(-1.0, 1.0, self.size).astype(np.float32), None
+        """Return an action (size,) or, for a batch of N observations, actions (N, size); nothing else is read."""
+        batch = np.shape(observation["desired_goal"])[:-1]
+        return self.rng.uniform(-1.0, 1.0, (*batch, self.size)).astype(np.float32), None
 
 
 CONTROLLERS: dict[str, Callable[[], SteadyController | PickAndPlaceController]] = {

@@ -3,9 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import tca_envs  # noqa: F401
-from agents.evaluate import evaluate, wilson
+from agents.evaluate import MOST_LANES, evaluate, lanes_for, wilson
 from agents.scripted import (
     BENDING_STARTS,
     PickAndPlaceController,
@@ -25,8 +26,12 @@ from tca_envs.mechanics import grasp
 from tca_envs.mechanics.rotation import yaw_angle
 
 
+def held_out(name, episodes):
+    return gym.make_vec(name, lanes_for(episodes), split="held-out")
+
+
 def reach_success(episodes):
-    return evaluate(ReachController(), gym.make("TCAReach-v0", split="held-out"), episodes, seed=50_000)
+    return evaluate(ReachController(), held_out("TCAReach-v0", episodes), episodes, seed=50_000)
 
 
 def test_reach_controller_solves_held_out_goals():
@@ -102,7 +107,7 @@ def test_jacobians_of_aims_are_those_of_differences(aim):
 
 
 def twist_align_success(episodes):
-    return evaluate(TwistAlignController(), gym.make("TCATwistAlign-v0", split="held-out"), episodes, seed=50_000)
+    return evaluate(TwistAlignController(), held_out("TCATwistAlign-v0", episodes), episodes, seed=50_000)
 
 
 def test_twist_align_controller_solves_held_out_goals():
@@ -117,7 +122,7 @@ def test_twist_align_controller_solves_a_thousand_held_out_goals():
 
 
 def pick_and_place_success(episodes):
-    return evaluate(PickAndPlaceController(), gym.make("TCAPickAndPlace-v0", split="held-out"), episodes, seed=50_000)
+    return evaluate(PickAndPlaceController(), held_out("TCAPickAndPlace-v0", episodes), episodes, seed=50_000)
 
 
 def test_pick_and_place_controller_solves_held_out_episodes():
@@ -179,39 +184,35 @@ def test_a_random_policy_fails_and_repeats():
     assert first.successes <= 1
 
 
-class Script:
-    """Heats full power for some steps, then nothing."""
-
-    def __init__(self, on):
-        self.on, self.step = on, 0
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=True):
-        self.step = self.step % 100 + 1
-        return np.full(3, 1.0 if self.step <= self.on else -1.0, np.float32), None
+class Idle:
+    def predict(self, observation, deterministic):
+        return np.zeros((len(observation), 3), np.float32), None
 
 
 class Countdown(gym.Env):
-    """Succeeds at the steps in `wins`, of 5."""
+    """Succeeds at some of its steps; what else is told is the seed times steps done."""
 
     observation_space = gym.spaces.Box(0, 1, (1,))
     action_space = gym.spaces.Box(-1, 1, (3,))
-
-    def __init__(self, wins):
-        self.wins = wins
-
     converged = True
 
+    def __init__(self, wins, steps=5):
+        self.wins, self.steps = wins, steps
+        self.seeds = []
+
     def info(self):
-        won = self.t in self.wins
-        return {"is_success": won, "distance_mm": 0.0, "energy_J": 1.0 * self.t, "solver": {"converged": self.converged}}
+        number = float(self.seeds[-1] * self.t)
+        solver = {"converged": self.converged}
+        return {"is_success": self.t in self.wins, "distance_mm": number, "energy_J": 10.0 * number, "solver": solver}
 
     def reset(self, *, seed=None, options=None):
         self.t = 0
-        return np.zeros(1), self.info()
+        self.seeds.append(1 if seed is None else seed)
+        return np.zeros(1, np.float32), self.info()
 
     def step(self, action):
         self.t += 1
-        return np.zeros(1), -1.0, False, self.t == 5, self.info()
+        return np.zeros(1, np.float32), -1.0, False, self.t == self.steps, self.info()
 
 
 @pytest.mark.parametrize(
@@ -219,17 +220,64 @@ class Countdown(gym.Env):
     [((3, 4, 5), 1, 0.3), ((1, 2, 4, 5), 1, 0.4), ((5,), 1, 0.5), ((0, 1, 2, 3, 4, 5), 1, 0.0), ((1, 2, 3, 4), 0, None)],
 )
 def test_success_is_that_of_the_last_step_and_its_time_is_since_when_it_is_held(wins, successes, seconds):
-    report = evaluate(Script(0), Countdown(wins), 1)
+    report = evaluate(Idle(), Countdown(wins), 1, seed=1)
     assert report.successes == successes
     assert report.time_to_success_s == pytest.approx(seconds)
-    assert (report.episode_return, report.energy_J) == (-5.0, 5.0)
+    assert (report.episode_return, report.final_distance_mm, report.energy_J) == (-5.0, 5.0, 50.0)
 
 
 def test_an_episode_that_the_solver_ends_is_no_success():
     env = Countdown((5,))
     env.converged = False
-    report = evaluate(Script(0), env, 2)
+    report = evaluate(Idle(), env, 2)
     assert (report.successes, report.solver_failures, report.time_to_success_s) == (0, 2, None)
+
+
+def test_each_lane_runs_its_own_episodes_to_their_ends():
+    """Lane 1 ends early and begins anew before the others are done; nothing of that counts."""
+    envs = [Countdown((5,)), Countdown((2, 3), 3), Countdown((4,))]
+    done = []
+    report = evaluate(Idle(), SyncVectorEnv([lambda env=env: env for env in envs]), 5, seed=100, progress=done.append)
+    assert envs[0].seeds == [100, 103] and envs[2].seeds == [102, 105]
+    assert envs[1].seeds[0] == 101 and 104 in envs[1].seeds
+    assert done == [1, 3, 4, 5]
+    assert report.successes == 4 and report.solver_failures == 0
+    assert report.time_to_success_s == pytest.approx((0.5 + 0.2 + 0.5 + 0.2) / 4)
+    assert report.final_distance_mm == (500 + 303 + 510 + 515 + 312) / 5
+    assert report.energy_J == 10 * report.final_distance_mm and report.episode_return == -(5 + 3 + 5 + 5 + 3) / 5
+
+
+def test_a_batch_finds_what_single_episodes_find():
+    for name, policy in (("TCAReach-v0", ReachController), ("TCAPickAndPlace-v0", PickAndPlaceController)):
+        options = {"split": "held-out", "max_episode_steps": 40}
+        batch = evaluate(policy(), gym.make_vec(name, 3, **options), 4, seed=7)
+        assert batch == evaluate(policy(), gym.make(name, **options), 4, seed=7)
+
+
+def test_a_controller_of_a_batch_remembers_each_lane(monkeypatch):
+    """Actions are those of one controller for each lane; only a new goal is planned for, be it another lane's."""
+    plans = []
+    make_plan = ReachController.plan
+    monkeypatch.setattr(ReachController, "plan", lambda self, goal: (plans.append(goal), make_plan(self, goal))[1])
+    env = gym.make_vec("TCAReach-v0", 3)
+    batch, single = ReachController(), [ReachController() for _ in range(3)]
+    observation, _ = env.reset(seed=3)
+    for step in range(4):
+        if step == 2:
+            observation["desired_goal"][1] = observation["desired_goal"][0]
+        plans.clear()
+        action, _ = batch.predict(observation)
+        assert len(plans) == {0: 3, 1: 0, 2: 1, 3: 1}[step]
+        assert action.shape == (3, 3) and action.dtype == np.float32
+        for lane, controller in enumerate(single):
+            row = {key: value[lane] for key, value in observation.items()}
+            np.testing.assert_array_equal(action[lane], controller.predict(row)[0])
+        observation, *_ = env.step(action)
+
+
+def test_lanes_are_as_many_as_there_are_episodes_or_share_them_evenly():
+    assert [lanes_for(count) for count in (1, 30, MOST_LANES)] == [1, 30, MOST_LANES]
+    assert lanes_for(MOST_LANES + 1) == MOST_LANES // 2 + 1 and lanes_for(4 * MOST_LANES) == MOST_LANES
 
 
 def test_wilson_interval():
@@ -241,7 +289,13 @@ def test_wilson_interval():
 @pytest.mark.parametrize("episodes", [0, -1, 1.5])
 def test_bad_episodes_are_refused(episodes):
     with pytest.raises(ValueError, match="episodes = "):
-        evaluate(Script(0), Countdown(()), episodes)
+        evaluate(Idle(), Countdown(()), episodes)
+
+
+def test_another_way_to_restart_is_refused():
+    env = SyncVectorEnv([lambda: Countdown(())], autoreset_mode=AutoresetMode.SAME_STEP)
+    with pytest.raises(ValueError, match=r"autoreset_mode AutoresetMode\.SAME_STEP: expected AutoresetMode\.NEXT_STEP"):
+        evaluate(Idle(), env, 1)
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(1, 0), (-1, 5), (6, 5)])

@@ -4,44 +4,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 import tca_envs  # noqa: F401
 from agents import dagger
-from agents.dagger import DAgger, EndWhenDone
+from agents.dagger import DAgger
 from agents.features import PickAndPlaceFeatures
+from agents.sb3 import make
 from agents.scripted import PickAndPlaceController
-from tca_envs import batch
-
-
-class Held(gym.Env):
-    """Succeeds at the steps in `wins`."""
-
-    observation_space = action_space = gym.spaces.Box(-1, 1, (1,))
-
-    def __init__(self, wins):
-        self.wins = wins
-
-    def reset(self, *, seed=None, options=None):
-        self.t = 0
-        return np.zeros(1), {}
-
-    def step(self, action):
-        self.t += 1
-        return np.zeros(1), 0.0, False, self.t == 20, {"is_success": self.t in self.wins}
-
-
-@pytest.mark.parametrize(("wins", "end"), [((3, 4, 5), 5), ((3, 4, 6, 7, 8), 8), ((1, 2), 20), ((), 20)])
-def test_episodes_end_when_the_goal_was_held_long_enough(wins, end):
-    env = EndWhenDone(Held(wins), 3)
-    for _ in range(2):  # the count starts anew
-        env.reset()
-        steps, over = 0, False
-        while not over:
-            *_, terminated, over, _ = env.step(None)
-            steps += 1
-            assert not terminated
-        assert steps == end
 
 
 def test_the_network_sees_the_differences():
@@ -70,7 +39,7 @@ def test_the_network_sees_the_differences():
 
 @pytest.fixture
 def learner():
-    envs = DummyVecEnv([lambda: gym.make("TCAPickAndPlace-v0") for _ in range(2)])
+    envs = make("TCAPickAndPlace-v0", 2)
     return DAgger("MultiInputPolicy", envs, controller="pick-and-place", n_steps=40, batch_size=80, n_epochs=20, seed=0)
 
 
@@ -101,11 +70,10 @@ def test_the_controller_is_recorded_whoever_drives(learner, by_controller, monke
 
 def test_learning_goes_on_where_it_stopped(learner):
     learner.learn(80)
-    env = learner.env.envs[0].unwrapped
-    left, _ = batch.look(env.task, env.core)
+    left = {key: value.copy() for key, value in learner._last_obs.items()}
     learner.learn(80, reset_num_timesteps=False)
     for key, value in learner.record[40][0].items():
-        np.testing.assert_array_equal(value[0], left[key][0])
+        np.testing.assert_array_equal(value, left[key])
 
 
 def test_the_policy_is_fitted_to_the_record(learner):
@@ -129,7 +97,7 @@ def test_a_saved_policy_acts_alike_and_leaves_the_record_behind(learner, tmp_pat
 
 
 def test_a_controller_is_asked_for():
-    env = DummyVecEnv([lambda: gym.make("TCAReach-v0")])
+    env = make("TCAReach-v0", 1)
     with pytest.raises(ValueError, match="controller = 'juggle': expected one of 'reach', "):
         DAgger("MultiInputPolicy", env, controller="juggle", n_steps=2, batch_size=2)
     with pytest.raises(ValueError, match="controller = None: expected one of 'reach', "):
@@ -137,6 +105,6 @@ def test_a_controller_is_asked_for():
 
 
 def test_other_controllers_can_be_imitated():
-    env = DummyVecEnv([lambda: gym.make("TCAReach-v0")])
+    env = make("TCAReach-v0", 1)
     model = DAgger("MultiInputPolicy", env, controller="reach", n_steps=20, batch_size=20, n_epochs=1)
     assert len(model.learn(20).record) == 20

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import tca_envs  # noqa: F401
 from tca_envs import batch
-from tca_envs.mechanics import collocation, grasp
+from tca_envs.mechanics import grasp, kernels
 from tca_envs.mechanics.thermal import HARD_LIMIT, SOFT_LIMIT
 from tca_envs.tasks import core
 
@@ -253,13 +253,13 @@ def test_a_failed_solve_keeps_the_last_good_state_and_truncates(env, monkeypatch
     before = unwrapped.get_state()
     observation, _ = batch.look(unwrapped.task, unwrapped.core)
 
-    def without_answer(arm, strain, tension, *rest):
-        rest[-1][:] = (collocation.FAILED, 1.0, 7, 0, 0)
+    def without_answer(*arguments):
+        arguments[9][:] = (kernels.FAILED, 1.0, 7, 0, 0)
 
     monkeypatch.setattr(core.ladder, "solve", without_answer)
     after, reward, terminated, truncated, info = unwrapped.step(np.ones(env.action_space.shape, np.float32))
     assert (terminated, truncated) == (False, True)
-    assert info["solver"] == {"converged": False, "residual": 1.0, "iterations": 7, "rung": collocation.FAILED, "jumped": False}
+    assert info["solver"] == {"converged": False, "residual": 1.0, "iterations": 7, "rung": kernels.FAILED, "jumped": False}
     assert np.isfinite(reward)
     for key in observation:
         assert observation[key][0].tobytes() == after[key].tobytes()

@@ -3,11 +3,13 @@
 import csv
 import json
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from zipfile import ZipFile
 
 import gymnasium as gym
 import matplotlib.image
@@ -17,6 +19,7 @@ from stable_baselines3 import PPO, SAC
 import train
 
 ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.filterwarnings("ignore:rich is experimental")  # SB3's progress bar
 
 
 def run(*arguments, cwd=ROOT, **options):
@@ -38,15 +41,28 @@ def test_a_run_leaves_policy_curve_and_report(trained):
     for name in ("policy.zip", "policy.json", "last.zip", "replay_buffer.pkl", "curve.csv", "curve.png", "report.json"):
         assert (folder / name).stat().st_size > 0
     assert matplotlib.image.imread(folder / "curve.png").shape[0] > 400
-    with (folder / "curve.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert int(float(rows[-1]["steps"])) == 1200
+    assert steps_of(folder)[-1] == 1200
     report = json.loads((folder / "report.json").read_text())
     assert set(report["held_out"]) == {"sac", "scripted", "random"}
     assert report["held_out"]["scripted"]["success_rate"] == 1.0
     assert report["seed"] == 3 and report["versions"]["gymnasium"]
     for name in ("sac", "scripted", "random"):
         assert f"{name}: success" in done.stdout
+
+
+def test_a_run_can_be_watched_in_tensorboard(trained):
+    pytest.importorskip("tensorboard", reason="not installed: pip install tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    folder, _ = trained
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    points = {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+    assert {"train/actor_loss", "rollout/ep_rew_mean", "rollout/success_rate", "eval/success_rate"} <= set(points)
+    with (folder / "curve.csv").open() as file:
+        last = list(csv.DictReader(file))[-1]
+    step, distance = points["eval/final_distance_mm"][-1]
+    assert step == float(last["steps"]) and distance == pytest.approx(float(last["final_distance_mm"]))
 
 
 def test_progress_is_shown(trained):
@@ -56,48 +72,85 @@ def test_progress_is_shown(trained):
 
 def test_eval_only_repeats_the_reports_numbers(trained):
     folder, _ = trained
-    done = run("--eval-only", folder, "--episodes", 2)
-    assert done.returncode == 0, done.stderr
+    assert train.main(["--eval-only", str(folder), "--episodes", "2"]) == 0
     report, again = (json.loads((folder / name).read_text()) for name in ("report.json", "evaluation.json"))
     assert report["held_out"] == again["held_out"]
 
 
-def test_resume_goes_on(trained):
-    folder, _ = trained
-    done = run("--resume", folder, "--steps", 400, "--episodes", 1)
-    assert done.returncode == 0, done.stderr
-    with (folder / "curve.csv").open() as file:
-        steps = [int(float(row["steps"])) for row in csv.DictReader(file)]
+def test_resume_goes_on_with_its_seed(trained, tmp_path):
+    folder = shutil.copytree(trained[0], tmp_path / "copy")
+    assert train.main(["--resume", str(folder), "--steps", "400", "--episodes", "1"]) == 0
+    steps = steps_of(folder)
     assert steps == sorted(steps) and steps[-1] == 1600
-
-
-def test_resume_keeps_the_seed(trained):
-    folder, _ = trained
     assert json.loads((folder / "report.json").read_text())["seed"] == 3
     assert json.loads((folder / "policy.json").read_text())["seed"] == 3
 
 
-def run_quickly(*arguments):
-    """Run with one episode for each point of the learning curve."""
-    quickly = "import sys, train; train.CURVE_EPISODES = 1; sys.exit(train.main(sys.argv[1:]))"
-    command = [sys.executable, "-c", quickly, *map(str, arguments), "--episodes", "1"]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+@pytest.fixture
+def quickly(monkeypatch):
+    """The command line in this process; points of the learning curve cost one episode."""
+    monkeypatch.setattr(train, "CURVE_EPISODES", 1)
+    return lambda *arguments: train.main([*map(str, arguments), "--episodes", "1"])
 
 
-def test_ppo_trains_and_goes_on_without_a_replay_buffer(tmp_path):
+def steps_of(folder):
+    with (folder / "curve.csv").open() as file:
+        return [int(float(row["steps"])) for row in csv.DictReader(file)]
+
+
+def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint_to_its_end(quickly, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "killed"
+    often = "import sys, train; train.CURVE_EPISODES = 1; train.CURVE_INTERVAL = 200; train.main(sys.argv[1:])"
+    command = [sys.executable, "-c", often, "--steps", "1400", "--seed", "5", "--out", str(folder)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            while not (folder / "curve.csv").exists() or len(steps_of(folder)) < 4:
+                assert process.poll() is None
+                time.sleep(0.02)
+        finally:
+            process.kill()
+    left = steps_of(folder)
+    assert left[:4] == [200, 400, 600, 800] and left[-1] < 1400 and not (folder / "report.json").exists()
+    assert quickly("--resume", folder) == 0
+    assert f"for {1400 - left[-1]} steps, seed 5" in capsys.readouterr().out
+    assert steps_of(folder) == [*left, 1400]
+    assert SAC.load(folder / "last.zip", device="cpu").num_timesteps == 1400
+    with (folder / "replay_buffer.pkl").open("rb") as file:
+        assert pickle.load(file).size() >= 1400 // 4 - 1  # SB3 stores a step after it has told of it
+    assert not list(folder.glob("new-*"))
+
+
+def parameters(folder, name="policy.zip"):
+    """The bytes of all weights in a saved policy."""
+    with ZipFile(folder / name) as saved:
+        return saved.read("policy.pth")
+
+
+def test_the_same_command_makes_the_same_policy(trained, tmp_path):
+    """Whatever else the process did before."""
+    folder, again = trained[0], tmp_path / "again"
+    assert train.main(["--steps", "1200", "--seed", "3", "--episodes", "2", "--out", str(again)]) == 0
+    assert parameters(folder) == parameters(again)
+    rows = []
+    for place in (folder, again):
+        with (place / "curve.csv").open() as file:
+            rows.append([{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)])
+    assert rows[0] == rows[1]
+    first, second = (json.loads((place / "report.json").read_text()) for place in (folder, again))
+    assert first["held_out"] == second["held_out"]
+
+
+def test_ppo_trains_and_goes_on_without_a_replay_buffer(quickly, tmp_path):
     folder = tmp_path / "ppo"
     for arguments in (["--algo", "ppo", "--out", folder], ["--resume", folder]):
-        done = run_quickly(*arguments, "--steps", 2048)
-        assert done.returncode == 0, done.stderr
-    with (folder / "curve.csv").open() as file:
-        assert [int(float(row["steps"])) for row in csv.DictReader(file)][-1] == 4096
+        assert quickly(*arguments, "--steps", 2048) == 0
+    assert steps_of(folder)[-1] == 4096
 
 
-def test_dagger_imitates_the_controller_and_goes_on_with_its_record(tmp_path):
+def test_dagger_imitates_the_controller_and_goes_on_with_its_record(quickly, tmp_path):
     folder = tmp_path / "dagger"
     for arguments in (["--task", "pick-and-place", "--out", folder, "--steps", 2000], ["--resume", folder, "--steps", 1000]):
-        done = run_quickly(*arguments)
-        assert done.returncode == 0, done.stderr
+        assert quickly(*arguments) == 0
     assert json.loads((folder / "policy.json").read_text())["algo"] == "dagger"
     with (folder / "replay_buffer.pkl").open("rb") as file:
         record = pickle.load(file)
@@ -109,7 +162,7 @@ def test_dagger_imitates_the_controller_and_goes_on_with_its_record(tmp_path):
 def test_a_fresh_run_leaves_nothing_of_an_earlier_one(tmp_path, monkeypatch):
     folder = tmp_path / "again"
     folder.mkdir()
-    for name in train.ARTEFACTS:
+    for name in ("policy.zip", "last.zip", "replay_buffer.pkl", "curve.csv", "report.json", "events.out.tfevents.17.host.3.0"):
         (folder / name).write_text("old")
     monkeypatch.setattr(train, "train", lambda *arguments: (0.0, True))
     assert train.main(["--out", str(folder)]) == 130
@@ -195,3 +248,11 @@ def test_a_broken_checkpoint_is_told(tmp_path, capsys):
     with pytest.raises(SystemExit):
         train.main(["--eval-only", str(folder)])
     assert "expected a sac policy" in capsys.readouterr().err
+
+
+def test_a_run_without_a_checkpoint_is_told(tmp_path, capsys):
+    (tmp_path / "policy.json").write_text('{"task": "reach", "algo": "sac"}')
+    with pytest.raises(SystemExit) as stop:
+        train.main(["--resume", str(tmp_path)])
+    assert stop.value.code == 2
+    assert "last.zip: not there; a run that ended before its first checkpoint" in capsys.readouterr().err

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 import tca_envs  # noqa: F401
-from tca_envs.mechanics import collocation, grasp
+from tca_envs.mechanics import grasp, kernels
 from tca_envs.tasks import core
 from tca_envs.tasks.pick_and_place import PickAndPlace
 from tca_envs.tasks.reach import Reach
@@ -63,14 +63,14 @@ def failing(monkeypatch):
     """A solver that has no answer where the first TCA is hotter than 50 degC; goals are drawn without one."""
     solve = core.ladder.solve
 
-    def solve_or_fail(arm, strain, tension, drive, load, asked, new_load, tip, lengths, report):
+    def solve_or_fail(arm, strain, tension, drive, load, asked, new_load, tip, lengths, report, *rest):
         state = (strain, tension, drive, load, tip, lengths)
         before = [values.copy() for values in state]
-        solve(arm, *state[:4], asked, new_load, tip, lengths, report)
+        solve(arm, *state[:4], asked, new_load, tip, lengths, report, *rest)
         bad = asked[:, 0] > 50.0
         for values, kept in zip(state, before, strict=True):
             values[bad] = kept[bad]
-        report[bad] = (collocation.FAILED, 1.0, 7, 0, 0)
+        report[bad] = (kernels.FAILED, 1.0, 7, 0, 0)
 
     def draw(task, core, generators):
         return np.array([generator.random(3) for generator in generators]), np.empty((len(generators), 0))
