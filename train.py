@@ -4,6 +4,8 @@ python train.py [--task reach] [--algo sac] [--steps N] [--seed S]      train an
 python train.py --resume runs/reach-sac-seed0                           go on with a run
 python train.py --eval-only runs/reach-sac-seed0                        evaluate a run
 python train.py --eval-only pretrained [--task reach]                   evaluate the policy that comes along
+python train.py --tune 30 [--task reach] [--algo ppo]                   search for better settings
+python train.py --benchmark [--seeds 0 1 2] [--jobs 2]                  all algorithms on all tasks: table and learning curves
 """
 
 import argparse
@@ -20,7 +22,7 @@ import gymnasium
 
 import tca_envs  # noqa: F401  (registers the environments)
 from agents.evaluate import Policy, Report, evaluate, lanes_for
-from agents.hyperparameters import ALGORITHMS, DEFAULT_ALGORITHM, HYPERPARAMETERS
+from agents.hyperparameters import ALGORITHMS, DEFAULT_ALGORITHM, HYPERPARAMETERS, for_learner
 from agents.scripted import CONTROLLERS, RandomPolicy
 
 EVALUATION_SEED = 1_000_000
@@ -42,6 +44,12 @@ CURVE_INTERVAL = 2_000
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     options = parse(arguments)
+    if options.benchmark:
+        from agents.benchmark import benchmark
+
+        tasks = [options.task] if options.task else list(HYPERPARAMETERS)
+        benchmark(options.out or Path("docs/benchmark"), tasks, options.seeds, options.jobs, options.quick)
+        return 0
     if options.eval_only == Path("pretrained"):
         options.eval_only = PRETRAINED / (options.task or "reach")
     source = options.eval_only or options.resume
@@ -63,6 +71,13 @@ def main(arguments: list[str] | None = None) -> int:
     import torch
 
     torch.set_num_threads(options.threads)
+    if options.tune is not None:
+        if find_spec("optuna") is None:
+            fail("--tune needs Optuna, which is in the extra `tune`: pip install -e '.[train,tune]'")
+        from agents.tuning import tune
+
+        tune(task, algorithm, settings, options.tune, options, options.out or Path("runs") / f"tune-{task}-{algorithm}")
+        return 0
     if options.resume:
         model = load(options.resume / "last.zip", algorithm, settings, options)
         buffer = options.resume / "replay_buffer.pkl"
@@ -77,8 +92,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not options.eval_only:
         folder.mkdir(parents=True, exist_ok=True)
         if not options.resume:
-            for path in [path for pattern in ARTEFACTS for path in folder.glob(pattern)]:
-                path.unlink()  # of an earlier run in the same folder
+            clear(folder)
         seconds, interrupted = train(model, task, algorithm, settings, options, folder)
         print(f"saved the policy, curve.csv and curve.png in {folder}")
         if interrupted:
@@ -87,14 +101,8 @@ def main(arguments: list[str] | None = None) -> int:
         model = load(folder / "policy.zip", algorithm, settings, options)
     reports = compare(model, task, algorithm, settings, options.episodes)
     report = {
-        "task": task,
-        "algo": algorithm,
-        "env": settings["env"],
-        "seed": options.seed,
-        "policy_steps": model.num_timesteps,
-        "training_seconds": round(seconds, 1),
+        **describe(model, task, algorithm, settings, options, seconds),
         "evaluation_seed": EVALUATION_SEED,
-        "versions": versions(),
         "held_out": {name: asdict(result) for name, result in reports.items()},
     }
     path = folder / ("evaluation.json" if options.eval_only else "report.json")
@@ -115,7 +123,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         "else the task's)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
-    parser.add_argument("--out", type=Path, help="folder of the run (default: runs/TASK-ALGO-seedS)")
+    parser.add_argument(
+        "--out", type=Path, help="folder of the run (default: runs/TASK-ALGO-seedS; of a benchmark docs/benchmark)"
+    )
     parser.add_argument(
         "--eval-only",
         type=Path,
@@ -123,6 +133,15 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         help='evaluate the run in this folder; "pretrained" is what comes along for the task',
     )
     parser.add_argument("--resume", type=Path, metavar="PATH", help="go on with the run in this folder")
+    parser.add_argument("--tune", type=int, metavar="N", help="search for better settings in N trials, with --steps each")
+    parser.add_argument(
+        "--benchmark",
+        action="store_true",
+        help="train all algorithms on all tasks, or on --task, and compare them",
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="of the benchmark (default: 0 1 2)")
+    parser.add_argument("--jobs", type=int, default=1, help="runs of the benchmark at a time (default: 1)")
+    parser.add_argument("--quick", action="store_true", help="a hundredth of the benchmark, to see whether it works")
     parser.add_argument("--episodes", type=int, default=200, help="held-out episodes to evaluate (default: 200)")
     parser.add_argument("--threads", type=int, default=1, help="threads of torch (default: 1: the networks are small)")
     parser.add_argument("--device", default="cpu", help="torch device (default: cpu)")
@@ -131,14 +150,16 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         fail(f"--task {options.task}: unknown; the tasks are {', '.join(HYPERPARAMETERS)}")
     if options.algo is not None and options.algo not in ALGORITHMS:
         fail(f"--algo {options.algo}: unknown; the algorithms are {', '.join(ALGORITHMS)}")
-    for name in ("steps", "episodes", "threads"):
+    for name in ("steps", "episodes", "threads", "jobs", "tune"):
         value = getattr(options, name)
         if value is not None and value < 1:
             fail(f"--{name} {value}: expected a positive integer")
-    if options.seed < 0:
-        fail(f"--seed {options.seed}: expected an integer of at least 0")
-    if options.eval_only is not None and options.resume is not None:
-        fail("--eval-only and --resume exclude each other")
+    for name, value in (("seed", options.seed), *(("seeds", value) for value in options.seeds)):
+        if value < 0:
+            fail(f"--{name} {value}: expected an integer of at least 0")
+    chosen = [name for name in ("eval_only", "resume", "tune", "benchmark") if getattr(options, name)]
+    if len(chosen) > 1:
+        fail(f"{' and '.join('--' + name.replace('_', '-') for name in chosen)} exclude each other")
     return options
 
 
@@ -180,14 +201,19 @@ def environments(settings: dict[str, Any], seed: int) -> Any:
 
     from agents.sb3 import make
 
-    return VecMonitor(make(settings["env"], settings["envs"], seed, settings.get("done_steps")))
+    return VecMonitor(make(settings["env"], settings["n_envs"], seed, settings.get("done_steps")))
+
+
+def clear(folder: Path) -> None:
+    """Remove what an earlier run left in the same folder."""
+    for path in [path for pattern in ARTEFACTS for path in folder.glob(pattern)]:
+        path.unlink()
 
 
 def build(algorithm: str, settings: dict[str, Any], options: argparse.Namespace) -> Any:
     """Return a fresh model."""
-    extra = {name: value for name, value in settings.items() if name not in ("env", "steps", "envs", "done_steps")}
     return learner(algorithm)(
-        "MultiInputPolicy", environments(settings, options.seed), seed=options.seed, device=options.device, **extra
+        env=environments(settings, options.seed), seed=options.seed, device=options.device, **for_learner(settings)
     )
 
 
@@ -200,7 +226,7 @@ def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse
     except Exception as error:  # SB3 passes on whatever torch, pickle and zipfile raise
         fail(f"{path}: expected a {algorithm} policy that this version of stable-baselines3 reads ({error})")
     # As many as it was trained with; goals go on, not again.
-    env = environments({**settings, "envs": model.n_envs}, options.seed + model.num_timesteps)
+    env = environments({**settings, "n_envs": model.n_envs}, options.seed + model.num_timesteps)
     for name in ("observation_space", "action_space"):
         if getattr(model, name) != getattr(env, name):
             fail(f"{path}: made for the {name} {getattr(model, name)}, but {settings['env']} has {getattr(env, name)}")
@@ -209,7 +235,13 @@ def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse
 
 
 def train(
-    model: Any, task: str, algorithm: str, settings: dict[str, Any], options: argparse.Namespace, folder: Path
+    model: Any,
+    task: str,
+    algorithm: str,
+    settings: dict[str, Any],
+    options: argparse.Namespace,
+    folder: Path,
+    progress_bar: bool = True,
 ) -> tuple[float, bool]:
     """Train, save and draw the learning curve; returns the seconds taken and whether Ctrl-C ended it.
 
@@ -221,7 +253,7 @@ def train(
     from agents.curve import Curve
 
     left = read_description(folder).get("steps", 0) - model.num_timesteps if options.resume else 0
-    steps = options.steps or (left if left > 0 else settings["steps"])
+    steps = options.steps or (left if left > 0 else settings["n_timesteps"])
     print(f"training {algorithm} on {settings['env']} for {steps} steps, seed {options.seed}, into {folder}")
     description = {
         "task": task,
@@ -243,7 +275,7 @@ def train(
     )
     interrupted = False
     try:
-        model.learn(steps, callback=curve, reset_num_timesteps=False, progress_bar=True)
+        model.learn(steps, callback=curve, reset_num_timesteps=False, progress_bar=progress_bar)
     except KeyboardInterrupt:
         interrupted = True
         curve.save()
@@ -267,6 +299,21 @@ def compare(model: Any, task: str, algorithm: str, settings: dict[str, Any], epi
     for name, report in reports.items():
         print(f"{name:>9}: {report}")
     return reports
+
+
+def describe(
+    model: Any, task: str, algorithm: str, settings: dict[str, Any], options: argparse.Namespace, seconds: float
+) -> dict[str, Any]:
+    """Return what a report says of a policy and its training."""
+    return {
+        "task": task,
+        "algo": algorithm,
+        "env": settings["env"],
+        "seed": options.seed,
+        "policy_steps": model.num_timesteps,
+        "training_seconds": round(seconds, 1),
+        "versions": versions(),
+    }
 
 
 def versions() -> dict[str, str]:

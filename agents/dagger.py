@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.type_aliases import MaybeCallback
 
-from agents.features import PickAndPlaceFeatures
 from agents.scripted import CONTROLLERS
 
 EXPERT_STEPS = 30_000
@@ -45,10 +44,7 @@ class DAgger(PPO):
             raise ValueError(f"controller = {controller!r}: expected one of {', '.join(map(repr, CONTROLLERS))}")
         self.controller = controller
         self.record: list[tuple[Observations, NDArray[np.float32]]] = []
-        made: dict[str, Any] = {"activation_fn": torch.nn.ReLU}
-        if controller == "pick-and-place":
-            made["features_extractor_class"] = PickAndPlaceFeatures
-        options["policy_kwargs"] = {**made, **(options.get("policy_kwargs") or {})}
+        options["policy_kwargs"] = {"activation_fn": torch.nn.ReLU, **(options.get("policy_kwargs") or {})}
         super().__init__(policy, env, **options)
 
     def _excluded_save_params(self) -> list[str]:

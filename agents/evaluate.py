@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import sqrt
+from math import isnan, sqrt
 from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from numpy.typing import NDArray
 
 from tca_envs.tasks.core import STEP_S
 
@@ -23,8 +24,28 @@ class Policy(Protocol):
 
 
 @dataclass(frozen=True)
+class Episodes:
+    """What became of n episodes. One succeeds if its last step does, by a converged solve: the goal must be held."""
+
+    success: NDArray[np.bool_]
+    """(n,)"""
+    held_since_s: NDArray[np.float64]
+    """(n,) time from which on the goal is held; without meaning for episodes that fail [s]."""
+    distance_mm: NDArray[np.float64]
+    """(n,) at the end."""
+    yaw_error_deg: NDArray[np.float64]
+    """(n,) at the end, nan where the task has none."""
+    energy_J: NDArray[np.float64]
+    """(n,) electrical."""
+    total: NDArray[np.float64]
+    """(n,) sum of the rewards."""
+    converged: NDArray[np.bool_]
+    """(n,) False for those that the solver truncated."""
+
+
+@dataclass(frozen=True)
 class Report:
-    """Result of `evaluate`. An episode succeeds if its last step does, by a converged solve: the goal must be held."""
+    """Result of `evaluate`, see `Episodes`."""
 
     episodes: int
     successes: int
@@ -33,6 +54,8 @@ class Report:
     """95 % Wilson score interval of the success rate."""
     final_distance_mm: float
     """Mean over episodes."""
+    final_yaw_error_deg: float | None
+    """Mean over episodes; None where the task has none."""
     time_to_success_s: float | None
     """Mean, over the episodes that succeed, of the time from which on the goal is held; None if none does."""
     energy_J: float
@@ -45,9 +68,10 @@ class Report:
     def __str__(self) -> str:
         low, high = self.success_interval
         time = "  --  " if self.time_to_success_s is None else f"{self.time_to_success_s:4.2f} s"
+        yaw = "" if self.final_yaw_error_deg is None else f"yaw error {self.final_yaw_error_deg:.2f} deg, "
         return (
             f"success {100 * self.success_rate:5.1f} % (95 % interval {100 * low:.1f}-{100 * high:.1f} %), "
-            f"final distance {self.final_distance_mm:.2f} mm, time to success {time}, energy {self.energy_J:.1f} J"
+            f"final distance {self.final_distance_mm:.2f} mm, {yaw}time to success {time}, energy {self.energy_J:.1f} J"
         )
 
 
@@ -75,6 +99,17 @@ def evaluate(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Report:
+    """Run a policy and sum up its episodes; parameters as of `run`."""
+    return summary(run(policy, env, episodes, seed, progress))
+
+
+def run(
+    policy: Policy,
+    env: VectorEnv[Any, Any, Any] | gymnasium.Env[Any, Any],
+    episodes: int,
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> Episodes:
     """Run a policy.
 
     Parameters
@@ -93,7 +128,7 @@ def evaluate(
 
     Returns
     -------
-    Report
+    Episodes
 
     Raises
     ------
@@ -112,11 +147,13 @@ def evaluate(
     converged = np.zeros(episodes, dtype=bool)
     held_since = np.zeros(episodes, dtype=int)
     distance, energy, total = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
+    yaw = np.full(episodes, np.nan)
     done = 0
     for first in range(0, episodes, lanes):
         seeds = [seed + first + lane for lane in range(lanes)]
-        observation, _ = env.reset(seed=seeds)  # type: ignore[arg-type]  # lists are fine
+        observation, info = env.reset(seed=seeds)  # type: ignore[arg-type]  # lists are fine
         running, steps = np.arange(min(lanes, episodes - first)), 0
+        held_since[first + running] = ~info["is_success"][running]  # at the first step's end, unless at rest already
         while running.size:
             action, _ = policy.predict(observation, deterministic=True)
             observation, reward, terminated, truncated, info = env.step(action)
@@ -129,18 +166,27 @@ def evaluate(
             converged[first + ended] = info["solver"]["converged"][ended]
             distance[first + ended] = info["distance_mm"][ended]
             energy[first + ended] = info["energy_J"][ended]
+            if "yaw_error_deg" in info:
+                yaw[first + ended] = info["yaw_error_deg"][ended]
             done += ended.size
             if progress is not None and ended.size:
                 progress(done)
-    success = held & converged
+    return Episodes(held & converged, held_since * STEP_S, distance, yaw, energy, total, converged)
+
+
+def summary(episodes: Episodes) -> Report:
+    """Sum up n episodes, at least one."""
+    success = episodes.success
+    yaw = float(episodes.yaw_error_deg.mean())
     return Report(
-        episodes=episodes,
+        episodes=success.size,
         successes=int(success.sum()),
         success_rate=float(success.mean()),
-        success_interval=wilson(int(success.sum()), episodes),
-        final_distance_mm=float(distance.mean()),
-        time_to_success_s=float(np.mean(held_since[success] * STEP_S)) if success.any() else None,
-        energy_J=float(energy.mean()),
-        episode_return=float(total.mean()),
-        solver_failures=int((~converged).sum()),
+        success_interval=wilson(int(success.sum()), success.size),
+        final_distance_mm=float(episodes.distance_mm.mean()),
+        final_yaw_error_deg=None if isnan(yaw) else yaw,
+        time_to_success_s=float(episodes.held_since_s[success].mean()) if success.any() else None,
+        energy_J=float(episodes.energy_J.mean()),
+        episode_return=float(episodes.total.mean()),
+        solver_failures=int((~episodes.converged).sum()),
     )

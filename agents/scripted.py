@@ -135,8 +135,7 @@ class TwistAlignController(SteadyController):
     def plan(self, goal: Array) -> Array:
         """Return temperatures (4,) [degC] that bring the tip to `goal` (5,): x, y, z [cm], cosine and sine of the yaw."""
         turn = unwrapped(float(np.arctan2(goal[4], goal[3])))
-        starts = np.column_stack([BENDING_STARTS, np.full(len(BENDING_STARTS), helix_temperature(self.arm, turn))])
-        return plan(self.arm, tip_and_yaw_at(goal[:3] / 100.0, turn), starts)
+        return plan(self.arm, tip_and_yaw_at(goal[:3] / 100.0, turn), twisted(self.arm, turn))
 
 
 class PickAndPlaceController:
@@ -221,12 +220,8 @@ class PickAndPlaceController:
         known, temperatures = self.plans.get(name, (None, None))
         if known is None or temperatures is None or np.abs(goal - known).max() > SAME_PLACE:
             arm = self.carrying if name == "target" else self.arm
-            twist, turn = AMBIENT, None
-            if len(goal) == 3:
-                turn = LEAST_TURN - (LEAST_TURN - goal[2]) % np.pi
-                twist = helix_temperature(arm, turn)
-            starts = np.column_stack([BENDING_STARTS, np.full(len(BENDING_STARTS), twist)])
-            temperatures = plan(arm, tool_at(goal[:2], turn), starts)
+            turn = LEAST_TURN - (LEAST_TURN - goal[2]) % np.pi if len(goal) == 3 else None
+            temperatures = plan(arm, tool_at(goal[:2], turn), twisted(arm, turn))
             self.plans[name] = goal, temperatures
         return temperatures
 
@@ -379,6 +374,12 @@ def helix_temperature(arm: Arm, turn: float) -> float:
     return float(np.interp(-turn, -np.array(turns), temperatures))
 
 
+def twisted(arm: Arm, turn: float | None) -> Array:
+    """Return where plans of the whole arm begin (s, 4) [degC]: `BENDING_STARTS`, the helix cold or turned by `turn` [rad]."""
+    helix = AMBIENT if turn is None else helix_temperature(arm, turn)
+    return np.column_stack([BENDING_STARTS, np.full(len(BENDING_STARTS), helix)])
+
+
 def plan(arm: Arm, aim: Aim, starts: Array) -> Array:
     """Return temperatures (n,) [degC] between ambient and the soft limit whose steady state misses `aim` least.
 
@@ -398,7 +399,7 @@ def plan(arm: Arm, aim: Aim, starts: Array) -> Array:
 def _gauss_newton(arm: Arm, aim: Aim, start: Array) -> tuple[Array, float]:
     """Return the best temperatures found from `start` and by how much they miss the aim [m]."""
     temperature, damping = start, 1e-3
-    here = _steady(arm, temperature)
+    here = steady(arm, temperature)
     error, jacobian = aim(here)
     for _ in range(30):
         if np.linalg.norm(error) < 0.1 * CLOSE_ENOUGH:
@@ -422,10 +423,10 @@ def _gauss_newton(arm: Arm, aim: Aim, start: Array) -> tuple[Array, float]:
         else:
             damping *= 5.0
     # Newton's way may have led to an equilibrium that heating does not lead to.
-    return temperature, float(np.linalg.norm(aim(_steady(arm, temperature))[0]))
+    return temperature, float(np.linalg.norm(aim(steady(arm, temperature))[0]))
 
 
-def _steady(arm: Arm, temperature: Array) -> Equilibrium:
+def steady(arm: Arm, temperature: Array) -> Equilibrium:
     """Return the equilibrium that slow heating from ambient to `temperature` reaches."""
     here = arm.equilibrium(np.full(len(temperature), AMBIENT))
     for part in np.linspace(0.1, 1.0, 10):

@@ -217,7 +217,14 @@ class Countdown(gym.Env):
 
 @pytest.mark.parametrize(
     ("wins", "successes", "seconds"),
-    [((3, 4, 5), 1, 0.3), ((1, 2, 4, 5), 1, 0.4), ((5,), 1, 0.5), ((0, 1, 2, 3, 4, 5), 1, 0.0), ((1, 2, 3, 4), 0, None)],
+    [
+        ((3, 4, 5), 1, 0.3),
+        ((1, 2, 4, 5), 1, 0.4),
+        ((5,), 1, 0.5),
+        ((0, 1, 2, 3, 4, 5), 1, 0.0),
+        ((1, 2, 3, 4), 0, None),
+        ((1, 2, 3, 4, 5), 1, 0.1),
+    ],
 )
 def test_success_is_that_of_the_last_step_and_its_time_is_since_when_it_is_held(wins, successes, seconds):
     report = evaluate(Idle(), Countdown(wins), 1, seed=1)

@@ -8,7 +8,7 @@ import torch
 import tca_envs  # noqa: F401
 from agents import dagger
 from agents.dagger import DAgger
-from agents.features import PickAndPlaceFeatures
+from agents.features import Features
 from agents.sb3 import make
 from agents.scripted import PickAndPlaceController
 
@@ -19,7 +19,7 @@ def test_the_network_sees_the_differences():
     observation, _ = env.reset(seed=3)
     for _ in range(4):  # twisted, and not yet there
         observation, *_ = env.step(controller.predict(observation)[0])
-    features = PickAndPlaceFeatures(env.observation_space)
+    features = Features(env.observation_space)
     batch = {key: torch.as_tensor(np.stack([value, value])) for key, value in observation.items()}
     found = features(batch).numpy()
     assert found.shape == (2, features.features_dim)

@@ -62,6 +62,26 @@ def test_constants_scale_with_the_rest_length_so_the_time_constant_does_not():
     np.testing.assert_allclose(HEATING.max_power, 2.0 * np.array([0.045, 0.045, 0.1111]) / REFERENCE_LENGTH, rtol=1e-14)
 
 
+@pytest.mark.parametrize("start", [25.0, 90.0, 157.0])
+def test_time_to_reach_is_that_of_full_power_or_none(start):
+    """`step` arrives after it, and less than that is not enough."""
+    target = np.array([26.0, 80.0, 150.0])
+    time = thermal.time_to_reach(start, target, HEATING)
+    assert (time > 0.0).all()
+    for i in range(3):
+        power = np.where(target[i] > start, HEATING.max_power, 0.0)
+        assert thermal.step(start, power, time[i], HEATING)[i] == pytest.approx(target[i], abs=1e-9)
+        assert abs(thermal.step(start, power, 0.99 * time[i], HEATING)[i] - target[i]) > 1e-3
+
+
+def test_time_to_reach_is_zero_at_the_target_and_infinite_beyond_what_heaters_reach():
+    hottest = HEATING.ambient + HEATING.max_power[0] / HEATING.loss[0]
+    times = [0.0, 0.0, np.inf, np.inf]
+    starts, targets = [25.0, 90.0, 90.0, 25.0], [25.0, 90.0, 25.0, 1.01 * hottest]
+    for start, target, time in zip(starts, targets, times, strict=True):
+        assert thermal.time_to_reach(start, target, HEATING)[0] == time
+
+
 @pytest.mark.parametrize("duration", [-0.1, np.nan, np.inf, "1"])
 def test_a_bad_duration_is_refused(duration):
     with pytest.raises(ValueError, match="duration = "):

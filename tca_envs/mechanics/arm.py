@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tca_envs.mechanics import check, closed_form, kernels, ladder, section
-from tca_envs.mechanics.collocation import JACOBIAN, SHAPE, Model, addresses, flat, linearise, solve_lanes
+from tca_envs.mechanics.collocation import JACOBIAN, SHAPE, Model, compile_kernels, flat, linearise, solve_lanes
 from tca_envs.mechanics.equilibrium import Equilibrium, Rung
 from tca_envs.mechanics.kernels import CLOSED_FORM, DESCENT, FAILED, FINER, LOAD, PAYLOAD_MASS, REPORT, SUBSTEPS, WARM
 from tca_envs.mechanics.ladder import TIME_LIMIT_S, Lane
@@ -433,7 +433,7 @@ class Arm:
         asked = (drive[np.newaxis], load[np.newaxis])
         on, message = self, ""
         if not (self.unstressed(load) and self._closed_form(lane, *asked, tip, lengths, report)):
-            addresses()
+            compile_kernels()
             begun = time.perf_counter()
             strain, tension, from_drive, from_load = lane
             solve_lanes(

@@ -174,6 +174,22 @@ def addresses() -> NDArray[np.int64]:
     return np.array([kernel.address for kernel in compiled], dtype=np.int64)
 
 
+@cache
+def compile_kernels():
+    """Compile everything or load it from the cache, so that this is no part of the time of a solve."""
+    one, none = np.ones(1, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    straight, load = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]), np.zeros((1, LOAD))
+    fields = (
+        one, one, np.ones(1), np.full((1, 1, 1), 0.5), np.ones((1, 1)), np.ones((1, 6)), straight, np.zeros(2, dtype=np.int64),
+        np.zeros((1, 0, 4)), np.zeros(1), none, np.zeros((0, PARAMETERS)), np.zeros(0), 1e-6,
+    )  # fmt: skip
+    model = Model(*fields, True, *flat(*fields))
+    drives = [np.zeros((1, 0)) for _ in range(4)]
+    linearise(model, straight, drives[0][0], drives[1][0], load[0], 0.0, False, SHAPE, straight)
+    known = (straight[np.newaxis].copy(), drives[0], drives[1], load.copy())
+    solve_lanes(model, *known, drives[2], load, np.eye(4)[np.newaxis].copy(), drives[3], np.zeros((1, REPORT)))
+
+
 _KEPT: list = []
 """Compiled kernels: their code lives as long as they do."""
 

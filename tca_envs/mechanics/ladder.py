@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs.mechanics.collocation import GIVEN, INERTIA, STEP, Heat, Model, addresses, linearise, solve_lanes
+from tca_envs.mechanics.collocation import GIVEN, INERTIA, STEP, Heat, Model, compile_kernels, linearise, solve_lanes
 from tca_envs.mechanics.kernels import DESCENT, FAILED, FINER, NEUTRAL, REPORT, SMALLEST_SUBSTEP, SUBSTEPS, WARM
 
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ def solve(
     Arguments as of `collocation.solve_lanes`; lanes without an answer are left as they were. An answer on a finer grid is
     carried to the arm's own.
     """
-    addresses()
+    compile_kernels()
     start = (strain.copy(), tension.copy(), from_drive.copy(), from_load.copy())
     lanes = (strain, tension, from_drive, from_load)
     solve_lanes(arm.model, *lanes, drive, load, tip, lengths, report, 1.0, threads, heat)

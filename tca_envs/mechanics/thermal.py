@@ -119,6 +119,20 @@ def constants(duration: float, limit: float, heating: Heating) -> Array:
     )
 
 
+def time_to_reach(temperature: ArrayLike, target: ArrayLike, heating: Heating) -> Array:
+    """Return the shortest time [s] in which a heater takes `temperature` (..., n) to `target` (..., n) [degC].
+
+    That is full power upwards and none downwards: C/lambda ln((T_end - T)/(T_end - target)) with the T_end of that power, by
+    solving `step` for the duration. It is infinite where the target is T_end or lies beyond it.
+    """
+    start, end = np.asarray(temperature, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    last = np.where(end >= start, heating.ambient + heating.max_power / heating.loss, heating.ambient)
+    # What is left of the way to T_end, as a share of the whole of it: 0 or less is never reached, no way takes no time.
+    left = np.divide(last - end, last - start, out=np.ones(np.broadcast(start, end, last).shape), where=end != start)
+    with np.errstate(divide="ignore"):
+        return -heating.capacity / heating.loss * np.log(np.maximum(left, 0.0))
+
+
 def steady_power(temperature: ArrayLike, heating: Heating) -> Array:
     """Return the power [W] that holds `temperature` [degC]."""
     return heating.loss * (np.asarray(temperature, dtype=np.float64) - heating.ambient)
