@@ -25,6 +25,7 @@ from tca_envs.mechanics.kernels import (
     LOAD,
     MAX_ITERATIONS,
     PAYLOAD_MASS,
+    REPORT,
 )  # fmt: skip
 from tca_envs.mechanics.muscle import PARAMETERS, TENDON, elongation, pull, stored
 from tca_envs.mechanics.packs import (
