@@ -68,7 +68,7 @@ def _look(temperature, power, full_power, achieved, goal, report, seen, reached,
         for j in range(goal.shape[1]):
             reached[i, j], desired[i, j] = achieved[i, j], goal[i, j]
             if j < 3:
-                away = float(reached[i, j]) - float(desired[i, j])
+                away = np.float64(reached[i, j]) - np.float64(desired[i, j])
                 square += away * away
         numbers[AWAY, i], numbers[COST, i] = math.sqrt(square), cost
         counts[RUNG, i], counts[ITERATIONS, i] = int(report[i, 0]), int(report[i, 2])
