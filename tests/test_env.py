@@ -251,7 +251,7 @@ def test_a_failed_solve_keeps_the_last_good_state_and_truncates(env, monkeypatch
     roll(env, actions(env, 5))
     unwrapped = env.unwrapped
     before = unwrapped.get_state()
-    observation, _ = batch.look(unwrapped.task, unwrapped.core)
+    observation, *_ = batch.look(unwrapped.task, unwrapped.core, unwrapped.core.rest_report)
 
     def without_answer(*arguments):
         arguments[9][:] = (kernels.FAILED, 1.0, 7, 0, 0)
@@ -324,6 +324,6 @@ def test_every_lane_of_a_batch_equals_the_single_environment_bitwise(name):
         for i, single in enumerate(singles):
             alone = task.step(single, command[i : i + 1])
             assert alone.tobytes() == report[i : i + 1].tobytes()
-            for one, all_lanes in zip(task.observe(single), task.observe(many), strict=True):
-                assert one.tobytes() == all_lanes[i : i + 1].tobytes()
+            seen, seen_alone = batch.look(task, many, report)[0], batch.look(task, single, alone)[0]
+            assert all(seen_alone[key].tobytes() == seen[key][i : i + 1].tobytes() for key in seen)
             assert single.record.strain.tobytes() == many.record.strain[i : i + 1].tobytes()

@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs import presets
+from tca_envs import batch, presets
 from tca_envs.mechanics import Rung, ladder, thermal
 from tca_envs.mechanics.collocation import SHAPE, Heat, linearise, solve_lanes
 from tca_envs.mechanics.kernels import REPORT
@@ -282,7 +282,7 @@ def drive(name: str, policy: str, steps: int, progress: Callable[[Iterable[int]]
             age += 1
             over = (age == episode) | ~solved(told)
             change.append(np.linalg.norm(record.temperature - before, axis=1))
-            numbers = [*task.observe(core), *(getattr(record, f.name) for f in fields(Record))]
+            numbers = [*batch.look(task, core, told)[0].values(), *(getattr(record, f.name) for f in fields(Record))]
             finite.append(np.all([np.isfinite(n.reshape(LANES, -1)).all(axis=1) for n in numbers], axis=0))
             rare = np.isin(told[:, 0], (Rung.FINER, Rung.DESCENT))
             if i % SAMPLED == 0:

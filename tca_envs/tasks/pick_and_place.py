@@ -13,7 +13,7 @@ from tca_envs.mechanics import grasp
 from tca_envs.mechanics.rotation import yaw, yaw_angle
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT, Heater
 from tca_envs.tasks.core import STEP_S, Core, Record, solved
-from tca_envs.tasks.task import Array, Mask, Outcome, Single, Task, box_with_heat, distance, observed, rounds
+from tca_envs.tasks.task import Array, Mask, Outcome, Single, Task, box_with_heat, rounds
 
 SUCCESS_CM = 0.3
 """An object at rest within 3 mm of the target, the gripper clear of it, is placed."""
@@ -202,10 +202,9 @@ class PickAndPlace(Task):
         scene = record.scene
         return np.column_stack([100.0 * scene[:, grasp.X : grasp.Z + 1], scene[:, grasp.TOUCHED] < 0.5])
 
-    def observe(self, core: Core) -> tuple[Single, Single]:
-        """Return what a controller measures (N, 23), and the object's position [cm] and whether it lies there free (N, 4)."""
+    def observe(self, core: Core, achieved: Single, result: Single) -> None:
+        """Write into `result` (N, 23) what a controller measures beside the heat."""
         record, scene = core.record, core.record.scene
-        result, lying = observed(core, 23), self.achieved(record).astype(np.float32)
         between = (scene[:, grasp.HELD] > 0.5) | (scene[:, grasp.ASTRIDE] > 0.5)
         gap = self.gap(record)
         place = tool(record)
@@ -215,14 +214,12 @@ class PickAndPlace(Task):
         result[:, TRAVEL] = scene[:, grasp.STAGE] / presets.STAGE_TRAVEL
         result[:, OPENING] = 100.0 * np.where(between, np.maximum(gap, presets.OBJECT.width), gap)
         result[:, FORCE] = np.where(between, self.pinch(record), 0.0) / FULL_FORCE
-        result[:, OBJECT] = lying[:, :3]
+        result[:, OBJECT] = achieved[:, :3]
         result[:, OBJECT_COS2] = np.cos(2.0 * scene[:, grasp.YAW])
         result[:, OBJECT_SIN2] = np.sin(2.0 * scene[:, grasp.YAW])
-        return result, lying
 
-    def judge(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Outcome:
+    def judge(self, achieved: NDArray[Any], desired: NDArray[Any], away: Array) -> Outcome:
         """Return what is to be said of goals (..., 4)."""
-        away = distance(achieved, desired)
         return Outcome((away <= SUCCESS_CM) & (achieved[..., 3] > 0.5), -away, {"distance_mm": 10.0 * away})
 
 
