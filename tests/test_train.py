@@ -16,6 +16,7 @@ import matplotlib.image
 import pytest
 from stable_baselines3 import PPO, SAC
 
+import agents
 import train
 
 ROOT = Path(__file__).parents[1]
@@ -196,6 +197,16 @@ def test_ctrl_c_saves_what_there_is(tmp_path):
         assert (folder / name).exists()
 
 
+def test_ray_is_needed_for_its_engine_only(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "agents.ray_engine", raising=False)
+    monkeypatch.delattr(agents, "ray_engine", raising=False)
+    with pytest.raises(SystemExit) as stop:
+        train.main(["--engine", "ray"])
+    assert stop.value.code == 2
+    assert "--engine ray needs Ray: pip install -e '.[train,ray]'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -206,6 +217,12 @@ def test_ctrl_c_saves_what_there_is(tmp_path):
         (["--seed", "-1"], "--seed -1: expected an integer of at least 0"),
         (["--eval-only", "nowhere"], "nowhere: expected the folder of a run"),
         (["--resume", "a", "--eval-only", "b"], "exclude each other"),
+        (["--engine", "steam"], "--engine steam: unknown; the engines are sb3, ray"),
+        (["--engine", "ray", "--algo", "sac"], "--engine ray trains ppo on the cpu, not sac on cpu"),
+        (["--engine", "ray", "--device", "cuda"], "--engine ray trains ppo on the cpu, not ppo on cuda"),
+        (["--engine", "ray", "--workers", "0"], "--workers 0: expected a positive integer"),
+        (["--engine", "ray", "--seeds", "1", "-2"], "--seeds -2: expected an integer of at least 0"),
+        (["--seeds", "1", "2"], "--seeds needs --benchmark or --engine ray"),
     ],
 )
 def test_bad_arguments_are_told(arguments, message, capsys):
