@@ -32,7 +32,7 @@ def run(*arguments, cwd=ROOT, **options):
 def trained(tmp_path_factory):
     """A short run by the command line."""
     folder = tmp_path_factory.mktemp("runs") / "short"
-    done = run("--algo", "sac", "--steps", 1216, "--seed", 3, "--episodes", 2, "--out", folder)
+    done = run("--algo", "sac", "--steps", 3264, "--seed", 3, "--episodes", 2, "--out", folder)
     assert done.returncode == 0, done.stderr
     return folder, done
 
@@ -42,7 +42,7 @@ def test_a_run_leaves_policy_curve_and_report(trained):
     for name in ("policy.zip", "policy.json", "last.zip", "replay_buffer.pkl", "curve.csv", "curve.png", "report.json"):
         assert (folder / name).stat().st_size > 0
     assert matplotlib.image.imread(folder / "curve.png").shape[0] > 400
-    assert steps_of(folder)[-1] == 1216
+    assert steps_of(folder)[-1] == 3264
     report = json.loads((folder / "report.json").read_text())
     assert set(report["held_out"]) == {"sac", "scripted", "random"}
     assert report["held_out"]["scripted"]["success_rate"] == 1.0
@@ -68,7 +68,7 @@ def test_a_run_can_be_watched_in_tensorboard(trained):
 
 def test_progress_is_shown(trained):
     _, done = trained
-    assert "1216/1,216" in (done.stdout + done.stderr).replace("1,216/1,216", "1216/1,216")
+    assert "3264/3,264" in (done.stdout + done.stderr).replace("3,264/3,264", "3264/3,264")
 
 
 def test_eval_only_repeats_the_reports_numbers(trained):
@@ -82,7 +82,7 @@ def test_resume_goes_on_with_its_seed(trained, tmp_path):
     folder = shutil.copytree(trained[0], tmp_path / "copy")
     assert train.main(["--resume", str(folder), "--steps", "384", "--episodes", "1"]) == 0
     steps = steps_of(folder)
-    assert steps == sorted(steps) and steps[-1] == 1600
+    assert steps == sorted(steps) and steps[-1] == 3648
     assert json.loads((folder / "report.json").read_text())["seed"] == 3
     assert json.loads((folder / "policy.json").read_text())["seed"] == 3
 
@@ -130,7 +130,7 @@ def parameters(folder, name="policy.zip"):
 def test_the_same_command_makes_the_same_policy(trained, tmp_path):
     """Whatever else the process did before."""
     folder, again = trained[0], tmp_path / "again"
-    assert train.main(["--algo", "sac", "--steps", "1216", "--seed", "3", "--episodes", "2", "--out", str(again)]) == 0
+    assert train.main(["--algo", "sac", "--steps", "3264", "--seed", "3", "--episodes", "2", "--out", str(again)]) == 0
     assert parameters(folder) == parameters(again)
     rows = []
     for place in (folder, again):
