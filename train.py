@@ -5,13 +5,16 @@ python train.py --resume runs/reach-sac-seed0                           go on wi
 python train.py --eval-only runs/reach-sac-seed0                        evaluate a run
 python train.py --eval-only pretrained [--task reach]                   evaluate the policy that comes along
 python train.py --tune 30 [--task reach] [--algo ppo]                   search for better settings
+python train.py --engine ray [--workers 2] [--seeds 0 1 2]              train PPO by Ray RLlib on several cores or machines
 python train.py --benchmark [--seeds 0 1 2] [--jobs 2]                  all algorithms on all tasks: table and learning curves
 """
 
 import argparse
 import json
+import os
 import platform
 import sys
+from contextlib import ExitStack
 from dataclasses import asdict
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -28,6 +31,7 @@ from agents.scripted import CONTROLLERS, RandomPolicy
 EVALUATION_SEED = 1_000_000
 """Held-out goals are drawn with seeds from here on."""
 PRETRAINED = Path(__file__).parent / "agents" / "pretrained"
+ENGINES = ("sb3", "ray")
 ARTEFACTS = (
     "policy.zip", "policy.json", "last.zip", "replay_buffer.pkl", "curve.csv", "curve.png", "report.json", "evaluation.json",
     "events.out.tfevents.*",
@@ -48,8 +52,33 @@ def main(arguments: list[str] | None = None) -> int:
         from agents.benchmark import benchmark
 
         tasks = [options.task] if options.task else list(HYPERPARAMETERS)
-        benchmark(options.out or Path("docs/benchmark"), tasks, options.seeds, options.jobs, options.quick)
+        benchmark(options.out or Path("docs/benchmark"), tasks, options.seeds or [0, 1, 2], options.jobs, options.quick)
         return 0
+    if options.resume:
+        options.engine = read_description(options.resume).get("engine", "sb3")
+    if options.engine == "ray":
+        return run_with_ray(options)
+    return run(options)
+
+
+def run_with_ray(options: argparse.Namespace) -> int:
+    """Train as asked, once or with each of the seeds, on a Ray cluster; returns the exit status."""
+    try:
+        from agents.ray_engine import cluster
+    except ModuleNotFoundError as error:
+        fail(f"--engine ray needs Ray: pip install -e '.[train,ray]' ({error})")
+    here = os.cpu_count() or 1
+    needed = options.workers + 1 if options.seeds else options.workers
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(cluster(options.address, needed if options.address else max(needed, here)))
+        except (ConnectionError, ValueError) as error:
+            fail(f"--workers {options.workers} --address {options.address}: {error}")
+        return run_seeds(options) if options.seeds else run(options)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Train or evaluate as asked; returns the exit status."""
     if options.eval_only == Path("pretrained"):
         options.eval_only = PRETRAINED / (options.task or "reach")
     source = options.eval_only or options.resume
@@ -64,9 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
         algorithm = description["algo"]
         options.seed = description.get("seed", options.seed)
     task = task or "reach"
-    algorithm = algorithm or DEFAULT_ALGORITHM[task]
-    if algorithm not in HYPERPARAMETERS[task]:
-        fail(f"--algo {algorithm}: not for the task {task!r}, whose algorithms are {', '.join(HYPERPARAMETERS[task])}")
+    algorithm = algorithm or ("ppo" if options.engine == "ray" else DEFAULT_ALGORITHM[task])
     settings = dict(HYPERPARAMETERS[task][algorithm])
     import torch
 
@@ -87,7 +114,7 @@ def main(arguments: list[str] | None = None) -> int:
         model = load(options.eval_only / "policy.zip", algorithm, settings, options)
     else:
         model = build(algorithm, settings, options)
-    folder = source or options.out or Path("runs") / f"{task}-{algorithm}-seed{options.seed}"
+    folder = source or options.out or Path("runs") / run_name(task, algorithm, options.engine, options.seed)
     seconds = 0.0
     if not options.eval_only:
         folder.mkdir(parents=True, exist_ok=True)
@@ -108,6 +135,34 @@ def main(arguments: list[str] | None = None) -> int:
     path = folder / ("evaluation.json" if options.eval_only else "report.json")
     path.write_text(json.dumps(report, indent=2) + "\n")
     print(f"wrote {path}")
+    return 0
+
+
+def run_name(task: str, algorithm: str, engine: str, seed: int) -> str:
+    """Return the name of a run's folder."""
+    return f"{task}-{algorithm}{'-ray' if engine == 'ray' else ''}-seed{seed}"
+
+
+def run_seeds(options: argparse.Namespace) -> int:
+    """Train with each of the seeds, as many at a time as there are processors for; returns the exit status."""
+    from agents.ray_engine import run_trials
+
+    task = options.task or "reach"
+    parent = (options.out or Path("runs")).absolute()
+
+    def trial(seed: int) -> dict[str, Any]:
+        folder = parent / run_name(task, "ppo", "ray", seed)
+        run(argparse.Namespace(**{**vars(options), "seed": seed, "out": folder}))
+        report: dict[str, Any] = json.loads((folder / "report.json").read_text())
+        return report["held_out"]["ppo"]
+
+    try:
+        results = run_trials(trial, options.seeds, options.workers)
+    except KeyboardInterrupt:
+        print(f"interrupted; runs that have begun go on with: python train.py --resume {parent}/...")
+        return 130
+    for seed, result in zip(options.seeds, results, strict=True):
+        print(f"seed {seed}: {Report(**result)}")
     return 0
 
 
@@ -139,22 +194,31 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         action="store_true",
         help="train all algorithms on all tasks, or on --task, and compare them",
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="of the benchmark (default: 0 1 2)")
+    parser.add_argument("--seeds", type=int, nargs="+", help="of the benchmark (default: 0 1 2), or of several runs with ray")
     parser.add_argument("--jobs", type=int, default=1, help="runs of the benchmark at a time (default: 1)")
     parser.add_argument("--quick", action="store_true", help="a hundredth of the benchmark, to see whether it works")
     parser.add_argument("--episodes", type=int, default=200, help="held-out episodes to evaluate (default: 200)")
     parser.add_argument("--threads", type=int, default=1, help="threads of torch (default: 1: the networks are small)")
     parser.add_argument("--device", default="cpu", help="torch device (default: cpu)")
+    parser.add_argument("--engine", default="sb3", help="sb3 (in one process) or ray (ppo with workers) (default: sb3)")
+    parser.add_argument("--workers", type=int, default=1, help="with ray: processes that step environments (default: 1)")
+    parser.add_argument("--address", help="with ray: of a running cluster (default: start one on this machine)")
     options = parser.parse_args(arguments)
     if options.task is not None and options.task not in HYPERPARAMETERS:
         fail(f"--task {options.task}: unknown; the tasks are {', '.join(HYPERPARAMETERS)}")
     if options.algo is not None and options.algo not in ALGORITHMS:
         fail(f"--algo {options.algo}: unknown; the algorithms are {', '.join(ALGORITHMS)}")
-    for name in ("steps", "episodes", "threads", "jobs", "tune"):
+    if options.engine not in ENGINES:
+        fail(f"--engine {options.engine}: unknown; the engines are {', '.join(ENGINES)}")
+    if options.engine == "ray" and (options.algo not in (None, "ppo") or options.device != "cpu"):
+        fail(f"--engine ray trains ppo on the cpu, not {options.algo or 'ppo'} on {options.device}")
+    if options.seeds and options.engine != "ray" and not options.benchmark:
+        fail("--seeds needs --benchmark or --engine ray")
+    for name in ("steps", "episodes", "threads", "jobs", "tune", "workers"):
         value = getattr(options, name)
         if value is not None and value < 1:
             fail(f"--{name} {value}: expected a positive integer")
-    for name, value in (("seed", options.seed), *(("seeds", value) for value in options.seeds)):
+    for name, value in (("seed", options.seed), *(("seeds", value) for value in options.seeds or [])):
         if value < 0:
             fail(f"--{name} {value}: expected an integer of at least 0")
     chosen = [name for name in ("eval_only", "resume", "tune", "benchmark") if getattr(options, name)]
@@ -186,13 +250,18 @@ def read_description(folder: Path) -> dict[str, Any]:
     return description
 
 
-def learner(algorithm: str) -> Any:
-    """Return the class of an algorithm: Stable-Baselines3's or our own in its form."""
+def learner(algorithm: str, engine: str = "sb3") -> Any:
+    """Return the class of an algorithm: Stable-Baselines3's, or our own in its form. HER is SAC with another buffer."""
     import stable_baselines3
 
     from agents.dagger import DAgger
 
-    return DAgger if algorithm == "dagger" else getattr(stable_baselines3, algorithm.upper())
+    if engine == "ray":
+        from agents.ray_engine import RayPPO
+
+        return RayPPO
+    own = {"dagger": DAgger, "her": stable_baselines3.SAC}
+    return own[algorithm] if algorithm in own else getattr(stable_baselines3, algorithm.upper())
 
 
 def environments(settings: dict[str, Any], seed: int) -> Any:
@@ -212,8 +281,11 @@ def clear(folder: Path) -> None:
 
 def build(algorithm: str, settings: dict[str, Any], options: argparse.Namespace) -> Any:
     """Return a fresh model."""
-    return learner(algorithm)(
-        env=environments(settings, options.seed), seed=options.seed, device=options.device, **for_learner(settings)
+    made = for_learner(settings)
+    if options.engine == "ray":
+        made |= {"env_id": settings["env"], "workers": options.workers}
+    return learner(algorithm, options.engine)(
+        env=environments(settings, options.seed), seed=options.seed, device=options.device, **made
     )
 
 
@@ -222,7 +294,7 @@ def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse
     if not path.exists():
         fail(f"{path}: not there; a run that ended before its first checkpoint has to start again")
     try:
-        model = learner(algorithm).load(path, device=options.device)
+        model = learner(algorithm, options.engine).load(path, device=options.device)
     except Exception as error:  # SB3 passes on whatever torch, pickle and zipfile raise
         fail(f"{path}: expected a {algorithm} policy that this version of stable-baselines3 reads ({error})")
     # As many as it was trained with; goals go on, not again.
@@ -231,6 +303,8 @@ def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse
         if getattr(model, name) != getattr(env, name):
             fail(f"{path}: made for the {name} {getattr(model, name)}, but {settings['env']} has {getattr(env, name)}")
     model.set_env(env)
+    if options.engine == "ray":
+        model.workers = options.workers
     return model
 
 
@@ -258,10 +332,11 @@ def train(
     description = {
         "task": task,
         "algo": algorithm,
+        "engine": options.engine,
         "seed": options.seed,
         "env": settings["env"],
         "steps": model.num_timesteps + steps,
-        "versions": versions(),
+        "versions": versions(options.engine),
     }
     (folder / "policy.json").write_text(json.dumps(description, indent=2) + "\n")
     model.set_logger(configure(str(folder), ["tensorboard"] if find_spec("tensorboard") else []))
@@ -312,13 +387,15 @@ def describe(
         "seed": options.seed,
         "policy_steps": model.num_timesteps,
         "training_seconds": round(seconds, 1),
-        "versions": versions(),
+        "versions": versions(options.engine),
     }
 
 
-def versions() -> dict[str, str]:
+def versions(engine: str) -> dict[str, str]:
     """Return the versions that made a policy."""
-    names = ("tca_envs", "gymnasium", "stable_baselines3", "torch", "numpy", "numba")
+    names = ["tca_envs", "gymnasium", "stable_baselines3", "torch", "numpy", "numba"]
+    if engine == "ray":
+        names.append("ray")
     return {"python": platform.python_version(), **{name: version(name) for name in names}}
 
 

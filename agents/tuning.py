@@ -148,10 +148,15 @@ def dagger(trial: optuna.Trial, settings: dict[str, Any]) -> dict[str, Any]:
     return {
         **_any(trial),
         "policy_kwargs": {**settings["policy_kwargs"], "net_arch": {"pi": [width, width], "vf": [1]}},
-        "batch_size": trial.suggest_categorical("batch_size", [250, 500, 1000]),
+        "batch_size": settings["n_envs"] * settings["n_steps"] // trial.suggest_categorical("batches", [10, 20, 40]),
         "n_epochs": trial.suggest_int("n_epochs", 4, 20),
     }
 
 
-SPACES: dict[str, Callable[[optuna.Trial, dict[str, Any]], dict[str, Any]]] = {"ppo": ppo, "sac": sac, "dagger": dagger}
+SPACES: dict[str, Callable[[optuna.Trial, dict[str, Any]], dict[str, Any]]] = {
+    "ppo": ppo,
+    "sac": sac,
+    "her": sac,
+    "dagger": dagger,
+}
 """What is searched for each algorithm."""
