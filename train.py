@@ -4,6 +4,7 @@ python train.py [--task reach] [--algo sac] [--steps N] [--seed S]      train an
 python train.py --resume runs/reach-sac-seed0                           go on with a run
 python train.py --eval-only runs/reach-sac-seed0                        evaluate a run
 python train.py --eval-only pretrained [--task reach]                   evaluate the policy that comes along
+python train.py --tune 30 [--task reach] [--algo ppo]                   search for better settings
 python train.py --engine ray [--workers 2] [--seeds 0 1 2]              train PPO by Ray RLlib on several cores or machines
 python train.py --benchmark [--seeds 0 1 2] [--jobs 2]                  all algorithms on all tasks: table and learning curves
 """
@@ -93,12 +94,17 @@ def run(options: argparse.Namespace) -> int:
         options.seed = description.get("seed", options.seed)
     task = task or "reach"
     algorithm = algorithm or ("ppo" if options.engine == "ray" else DEFAULT_ALGORITHM[task])
-    if algorithm not in HYPERPARAMETERS[task]:
-        fail(f"--algo {algorithm}: not for the task {task!r}, whose algorithms are {', '.join(HYPERPARAMETERS[task])}")
     settings = dict(HYPERPARAMETERS[task][algorithm])
     import torch
 
     torch.set_num_threads(options.threads)
+    if options.tune is not None:
+        if find_spec("optuna") is None:
+            fail("--tune needs Optuna, which is in the extra `tune`: pip install -e '.[train,tune]'")
+        from agents.tuning import tune
+
+        tune(task, algorithm, settings, options.tune, options, options.out or Path("runs") / f"tune-{task}-{algorithm}")
+        return 0
     if options.resume:
         model = load(options.resume / "last.zip", algorithm, settings, options)
         buffer = options.resume / "replay_buffer.pkl"
@@ -182,6 +188,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         help='evaluate the run in this folder; "pretrained" is what comes along for the task',
     )
     parser.add_argument("--resume", type=Path, metavar="PATH", help="go on with the run in this folder")
+    parser.add_argument("--tune", type=int, metavar="N", help="search for better settings in N trials, with --steps each")
     parser.add_argument(
         "--benchmark",
         action="store_true",
@@ -207,15 +214,16 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         fail(f"--engine ray trains ppo on the cpu, not {options.algo or 'ppo'} on {options.device}")
     if options.seeds and options.engine != "ray" and not options.benchmark:
         fail("--seeds needs --benchmark or --engine ray")
-    for name in ("steps", "episodes", "threads", "jobs", "workers"):
+    for name in ("steps", "episodes", "threads", "jobs", "tune", "workers"):
         value = getattr(options, name)
         if value is not None and value < 1:
             fail(f"--{name} {value}: expected a positive integer")
     for name, value in (("seed", options.seed), *(("seeds", value) for value in options.seeds or [])):
         if value < 0:
             fail(f"--{name} {value}: expected an integer of at least 0")
-    if options.eval_only is not None and options.resume is not None:
-        fail("--eval-only and --resume exclude each other")
+    chosen = [name for name in ("eval_only", "resume", "tune", "benchmark") if getattr(options, name)]
+    if len(chosen) > 1:
+        fail(f"{' and '.join('--' + name.replace('_', '-') for name in chosen)} exclude each other")
     return options
 
 
@@ -243,7 +251,7 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 def learner(algorithm: str, engine: str = "sb3") -> Any:
-    """Return the class of an algorithm: Stable-Baselines3's or our own in its form."""
+    """Return the class of an algorithm: Stable-Baselines3's, or our own in its form. HER is SAC with another buffer."""
     import stable_baselines3
 
     from agents.dagger import DAgger
@@ -252,7 +260,8 @@ def learner(algorithm: str, engine: str = "sb3") -> Any:
         from agents.ray_engine import RayPPO
 
         return RayPPO
-    return DAgger if algorithm == "dagger" else getattr(stable_baselines3, algorithm.upper())
+    own = {"dagger": DAgger, "her": stable_baselines3.SAC}
+    return own[algorithm] if algorithm in own else getattr(stable_baselines3, algorithm.upper())
 
 
 def environments(settings: dict[str, Any], seed: int) -> Any:
@@ -282,6 +291,8 @@ def build(algorithm: str, settings: dict[str, Any], options: argparse.Namespace)
 
 def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse.Namespace) -> Any:
     """Return a saved model; prints a message and exits with 2 if it is none or was made for other spaces."""
+    if not path.exists():
+        fail(f"{path}: not there; a run that ended before its first checkpoint has to start again")
     try:
         model = learner(algorithm, options.engine).load(path, device=options.device)
     except Exception as error:  # SB3 passes on whatever torch, pickle and zipfile raise

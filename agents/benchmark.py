@@ -37,7 +37,7 @@ EPISODES, QUICK_EPISODES = 200, 10
 QUICK_SHARE = 0.01
 """Of the steps, in a quick look."""
 TITLES = {"reach": "Reach", "twist-align": "TwistAlign", "pick-and-place": "PickAndPlace"}
-NAMES = {"ppo": "PPO", "sac": "SAC", "her": "SAC + HER", "tqc": "TQC", "dagger": "DAgger"}
+NAMES = {"ppo": "PPO", "sac": "SAC", "her": "SAC + HER", "dagger": "DAgger"}
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def benchmark(
 
 def policies(task: str) -> list[str]:
     """Return the rows of a task's table."""
-    return [*REFERENCES, *sorted(HYPERPARAMETERS[task])]
+    return [*REFERENCES, *(name for name in NAMES if name in HYPERPARAMETERS[task])]
 
 
 def each(work: Callable[[Run], Run], runs: list[Run], jobs: int) -> Iterable[Run]:

@@ -67,10 +67,9 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
 
     def _told(self, report: NDArray[np.float64]) -> tuple[dict[str, NDArray[Any]], float, dict[str, Any]]:
         """Return observation, reward and info: the only row of a batch of one."""
-        observation, outcome = batch.look(self.task, self.core)
+        observation, outcome, info = batch.look(self.task, self.core, report)
         reward = batch.rewards(self.reward, outcome)
-        info = batch.of_lane(batch.infos(self.core.record, outcome, report), 0)
-        return {key: values[0] for key, values in observation.items()}, float(reward[0]), info
+        return {key: values[0] for key, values in observation.items()}, reward.item(0), batch.of_lane(info, 0)
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
         """Return the reward of a goal (k,) as a float, or of a batch (..., k) as an array (...,); `info` is not read."""

@@ -42,7 +42,8 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         When a lane whose episode has ended starts anew: "NextStep", "SameStep", or "Disabled": by `reset` with the option
         "reset_mask".
     threads : int, optional
-        How many threads share the lanes; by default as many as Numba has.
+        How many threads share the lanes; by default as many as Numba has. A process that has used several can be forked, but
+        the fork must keep to one; workers started by "spawn" are free to choose.
 
     Raises
     ------
@@ -120,9 +121,9 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._ready = True
         self._start(np.flatnonzero(mask))
         self._over[mask] = False
-        observation, outcome = batch.look(self.task, self.core)
         report = np.repeat(self.core.rest_report, self.num_envs, axis=0)
-        return observation, _with_masks(batch.infos(self.core.record, outcome, report), mask)
+        observation, _, info = batch.look(self.task, self.core, report)
+        return observation, _with_masks(info, mask)
 
     def step(self, actions: NDArray[Any]) -> tuple[Observation, NDArray[np.float64], Mask, Mask, dict[str, Any]]:
         """Act for 0.1 s in all lanes, but for those that start anew instead; see `gymnasium.vector.VectorEnv.step`.
@@ -153,11 +154,10 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             self._start(anew)
             report[anew] = self.core.rest_report
             truncated[anew] = False
-        observation, outcome = batch.look(self.task, self.core)
+        observation, outcome, info = batch.look(self.task, self.core, report)
         reward = batch.rewards(self.reward, outcome)
         if anew.size:
             reward[anew] = 0.0
-        info = batch.infos(self.core.record, outcome, report)
         final: dict[str, Any] = {}
         if mode is AutoresetMode.SAME_STEP and truncated.any():
             final = {
@@ -169,8 +169,7 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             ended = np.flatnonzero(truncated)
             self._start(ended)
             report[ended] = self.core.rest_report
-            observation, outcome = batch.look(self.task, self.core)
-            info = batch.infos(self.core.record, outcome, report)
+            observation, _, info = batch.look(self.task, self.core, report)
         self._over = truncated.copy()
         infos = {**_with_masks(info, np.ones(self.num_envs, dtype=np.bool_)), **final}
         return observation, reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, infos

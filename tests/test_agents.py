@@ -261,15 +261,20 @@ def test_a_batch_finds_what_single_episodes_find():
         assert batch == evaluate(policy(), gym.make(name, **options), 4, seed=7)
 
 
-def test_a_controller_of_a_batch_remembers_each_lane():
-    """Actions are those of one controller for each lane, though lanes have different goals and one changes its own."""
+def test_a_controller_of_a_batch_remembers_each_lane(monkeypatch):
+    """Actions are those of one controller for each lane; only a new goal is planned for, be it another lane's."""
+    plans = []
+    make_plan = ReachController.plan
+    monkeypatch.setattr(ReachController, "plan", lambda self, goal: (plans.append(goal), make_plan(self, goal))[1])
     env = gym.make_vec("TCAReach-v0", 3)
     batch, single = ReachController(), [ReachController() for _ in range(3)]
     observation, _ = env.reset(seed=3)
     for step in range(4):
         if step == 2:
             observation["desired_goal"][1] = observation["desired_goal"][0]
+        plans.clear()
         action, _ = batch.predict(observation)
+        assert len(plans) == {0: 3, 1: 0, 2: 1, 3: 1}[step]
         assert action.shape == (3, 3) and action.dtype == np.float32
         for lane, controller in enumerate(single):
             row = {key: value[lane] for key, value in observation.items()}

@@ -13,8 +13,9 @@ from scipy.stats import spearmanr
 
 from tca_envs import presets
 from tca_envs.mechanics import Arm, Grid, shooting
-from tca_envs.mechanics.collocation import REPORT, solve_lanes
+from tca_envs.mechanics.collocation import solve_lanes
 from tca_envs.mechanics.discretisation import cost
+from tca_envs.mechanics.kernels import REPORT
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
 from tca_envs.tasks.core import CUT_OFF
 

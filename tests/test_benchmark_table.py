@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import matplotlib.image
 import numpy as np
@@ -162,3 +163,21 @@ def test_the_command_line_refuses_what_makes_no_sense(arguments, message, capsys
     with pytest.raises(SystemExit, match="2"):
         train.main(["--benchmark", *arguments])
     assert message in capsys.readouterr().err
+
+
+PUBLISHED = Path(train.__file__).parent / "docs" / "benchmark" / "benchmark.csv"
+LEAST = {"reach": (0.98, 5.0), "twist-align": (0.95, 15.0), "pick-and-place": (0.9, 60.0)}
+"""Success rate that the default of a task has to come to, and in how many minutes."""
+
+
+@pytest.mark.skipif(not PUBLISHED.exists(), reason="no benchmark was run here: python train.py --benchmark")
+@pytest.mark.parametrize("task", LEAST)
+def test_the_published_defaults_are_the_best_and_good_enough(task):
+    table = [row for row in read(PUBLISHED) if row["task"] == task and row["policy"] not in benchmark.REFERENCES]
+    (default,) = [row for row in table if row["default"] == "True"]
+    rate, minutes = LEAST[task]
+    assert int(default["successes"]) >= rate * int(default["episodes"]) and float(default["minutes"]) < minutes
+    assert int(default["seeds"]) >= 3
+    best = max(table, key=lambda row: (int(row["successes"]), -float(row["over_fastest"])))
+    # A rate within the interval of the best one is no worse.
+    assert default == best or int(default["successes"]) >= float(best["low"]) * int(best["episodes"])

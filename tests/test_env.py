@@ -13,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import tca_envs  # noqa: F401
 from tca_envs import batch
-from tca_envs.mechanics import collocation, grasp
+from tca_envs.mechanics import grasp, kernels
 from tca_envs.mechanics.thermal import HARD_LIMIT, SOFT_LIMIT
 from tca_envs.tasks import core
 
@@ -251,15 +251,15 @@ def test_a_failed_solve_keeps_the_last_good_state_and_truncates(env, monkeypatch
     roll(env, actions(env, 5))
     unwrapped = env.unwrapped
     before = unwrapped.get_state()
-    observation, _ = batch.look(unwrapped.task, unwrapped.core)
+    observation, *_ = batch.look(unwrapped.task, unwrapped.core, unwrapped.core.rest_report)
 
-    def without_answer(arm, strain, tension, *rest):
-        rest[-1][:] = (collocation.FAILED, 1.0, 7, 0, 0)
+    def without_answer(*arguments):
+        arguments[9][:] = (kernels.FAILED, 1.0, 7, 0, 0)
 
     monkeypatch.setattr(core.ladder, "solve", without_answer)
     after, reward, terminated, truncated, info = unwrapped.step(np.ones(env.action_space.shape, np.float32))
     assert (terminated, truncated) == (False, True)
-    assert info["solver"] == {"converged": False, "residual": 1.0, "iterations": 7, "rung": collocation.FAILED, "jumped": False}
+    assert info["solver"] == {"converged": False, "residual": 1.0, "iterations": 7, "rung": kernels.FAILED, "jumped": False}
     assert np.isfinite(reward)
     for key in observation:
         assert observation[key][0].tobytes() == after[key].tobytes()
@@ -324,6 +324,6 @@ def test_every_lane_of_a_batch_equals_the_single_environment_bitwise(name):
         for i, single in enumerate(singles):
             alone = task.step(single, command[i : i + 1])
             assert alone.tobytes() == report[i : i + 1].tobytes()
-            for one, all_lanes in zip(task.observe(single), task.observe(many), strict=True):
-                assert one.tobytes() == all_lanes[i : i + 1].tobytes()
+            seen, seen_alone = batch.look(task, many, report)[0], batch.look(task, single, alone)[0]
+            assert all(seen_alone[key].tobytes() == seen[key][i : i + 1].tobytes() for key in seen)
             assert single.record.strain.tobytes() == many.record.strain[i : i + 1].tobytes()

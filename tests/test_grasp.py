@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import tca_envs  # noqa: F401
 from tca_envs import presets
-from tca_envs.mechanics import collocation, grasp
+from tca_envs.mechanics import grasp, kernels
 from tca_envs.mechanics.grasp import ALONG, ASTRIDE, DROP, HELD, LOW, SCENE, STAGE, YAW, Box, Site, X, Y, Z
 from tca_envs.tasks import core
 
@@ -705,8 +705,8 @@ def test_without_an_equilibrium_nothing_moves(made, monkeypatch):
     hand = Hand(made).pick()
     before = hand.env.get_state()
 
-    def without_answer(arm, strain, tension, *rest):
-        rest[-1][:] = (collocation.FAILED, 1.0, 7, 0, 0)
+    def without_answer(*arguments):
+        arguments[9][:] = (kernels.FAILED, 1.0, 7, 0, 0)
 
     monkeypatch.setattr(core.ladder, "solve", without_answer)
     *_, truncated, _ = hand.env.step(np.ones(6, dtype=np.float32))

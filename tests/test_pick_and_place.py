@@ -6,7 +6,7 @@ import pytest
 
 import tca_envs  # noqa: F401
 from agents.scripted import PickAndPlaceController
-from tca_envs import presets
+from tca_envs import batch, presets
 from tca_envs.mechanics import grasp
 from tca_envs.tasks.pick_and_place import APART_CM, PickAndPlace, heading, tool
 
@@ -68,7 +68,7 @@ def test_object_and_target_can_be_reached_and_come_from_their_split(split):
 )
 def test_success_takes_the_place_and_the_gripper_away(task, achieved, success):
     desired = np.array([0.0, 0.0, AT_REST_CM, 1.0])
-    assert bool(task.judge(np.array(achieved), desired).success) is success
+    assert bool(batch.outcome(task, achieved, desired).success) is success
     assert gym.make("TCAPickAndPlace-v0").unwrapped.compute_reward(np.array(achieved), desired, {}) == success - 1.0
     distance = np.linalg.norm(np.array(achieved)[:3] - desired[:3])
     dense = gym.make("TCAPickAndPlaceDense-v0").unwrapped.compute_reward(np.array(achieved), desired, {})
@@ -161,9 +161,8 @@ def test_the_observation_says_what_is_there():
             assert seen[17] == 0.0
             np.testing.assert_allclose(record.payload, core.rest.payload)
         forces += seen[17] > 0.0
-        assert info["is_success"] is bool(
-            env.unwrapped.task.judge(observation["achieved_goal"], observation["desired_goal"]).success
-        )
+        told = batch.outcome(env.unwrapped.task, observation["achieved_goal"], observation["desired_goal"])
+        assert info["is_success"] is bool(told.success)
     assert held > 20 and forces >= held and info["is_success"]
 
 

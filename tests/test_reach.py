@@ -24,7 +24,7 @@ def test_a_goal_is_the_tip_that_steady_powers_reach():
         action = 2.0 * thermal.steady_power(temperature, core.heating) / core.heating.max_power - 1.0
         for _ in range(int(40.0 / STEP_S)):
             core.step(action[np.newaxis])
-        np.testing.assert_allclose(task.achieved(core.record), task.achieved(settled), atol=1e-4)
+        np.testing.assert_allclose(task.achieved(core.record), task.achieved(settled), atol=1e-5)
 
 
 def test_splits_are_a_fifth_and_disjoint():

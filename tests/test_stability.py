@@ -898,4 +898,4 @@ def test_results_survive_pickling():
 def test_the_kernels_are_compiled_once():
     """Of another layout of its arrays a kernel is another one, and half a minute to compile."""
     bending_arm()
-    assert len(collocation._solve_lanes.signatures) == 1
+    assert len(collocation._solve_serially.signatures) == len(collocation._linearise.signatures) == 1

@@ -7,6 +7,8 @@ from scipy.integrate import solve_ivp
 from tca_envs.mechanics import thermal
 from tca_envs.mechanics.muscle import REFERENCE_LENGTH
 from tca_envs.mechanics.thermal import Heater
+from tca_envs.tasks import TASKS
+from tca_envs.tasks.core import CUT_OFF, STEP_S
 
 HEATING = Heater().scaled([0.045, 0.045, 0.1111])
 
@@ -102,3 +104,22 @@ def test_bad_constants_are_refused(name, value):
 def test_bad_rest_lengths_are_refused(lengths):
     with pytest.raises(ValueError, match="rest_lengths = "):
         Heater().scaled(lengths)
+
+
+def test_environments_heat_by_the_closed_form_up_to_the_cut_off():
+    """What is compiled into the loop over lanes against the functions of `thermal`, from cold to the cut-off."""
+    lanes = TASKS["pick-and-place"]("train", 1e-5).core(6)
+    rng, cut = np.random.default_rng(0), 0
+    for _ in range(40):
+        action = np.clip(rng.uniform(-1.5, 9.0, (6, 5)), -1.5, 1.5)
+        before, energy = lanes.record.temperature.copy(), lanes.record.energy.copy()
+        lanes.step(action)
+        asked = 0.5 * (np.clip(action, -1.0, 1.0) + 1.0) * lanes.heating.max_power
+        allowed = np.maximum(thermal.power_to_reach(before, CUT_OFF, STEP_S, lanes.heating), 0.0)
+        power = np.minimum(asked, allowed)
+        cut += int((allowed < asked).sum())
+        np.testing.assert_allclose(lanes.record.power, power, rtol=1e-12, atol=1e-12)
+        expected = thermal.step(before, power, STEP_S, lanes.heating)
+        np.testing.assert_allclose(lanes.record.temperature, expected, rtol=1e-13)
+        np.testing.assert_allclose(lanes.record.energy - energy, power.sum(axis=1) * STEP_S, rtol=1e-10)
+    assert cut > 10

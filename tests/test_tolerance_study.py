@@ -21,7 +21,7 @@ def test_a_task_is_measured_at_every_tolerance(kept):
     for k in kept:
         assert k.error.shape == (6,) and k.within == 1.0
         assert k.arm.discretisation.tolerance == k.tolerance
-        assert 0.0 < k.solve < k.step < 1.0
+        assert 0.0 < k.solve < 1.0 and 0.0 < k.step < 1.0
     medians = [np.median(k.error) for k in kept]
     assert medians == sorted(medians, reverse=True) and medians[0] > 1e-7 and 0.0 < medians[-1] < 1e-8
 

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from tca_envs.mechanics import Rung, ladder
+from tca_envs.mechanics import Rung, ladder, thermal
 from tca_envs.study import torture
 from tca_envs.tasks import TASKS, core
 from tca_envs.tasks.reach import Reach
@@ -20,8 +20,11 @@ class Heated(core.Core):
     def __init__(self, task):
         vars(self).update(vars(task.core(torture.LANES)))
 
-    def _solve(self, record, temperature):
-        record.temperature[:] = temperature
+    def _solve(self, record, temperature, heat=None):
+        asked = 0.5 * (heat.action + 1.0) * self.heating.max_power
+        allowed = thermal.power_to_reach(record.temperature, core.CUT_OFF, core.STEP_S, self.heating)
+        power = np.clip(allowed, 0.0, asked)
+        record.temperature[:] = thermal.step(record.temperature, power, core.STEP_S, self.heating)
         return np.zeros((len(temperature), 4))
 
 
@@ -104,11 +107,14 @@ def test_a_broken_solver_is_found_out(monkeypatch, no_goals):
     """One that gives up above 60 degC: each failure is counted, told with its temperatures, and ends the episode."""
 
     def gives_up(*arguments):
+        state = (*arguments[1:5], *arguments[7:9])
+        before = [values.copy() for values in state]
+        SOLVE(*arguments)
         if arguments[5].max() > 60.0:
-            arguments[-1][:] = 0.0
-            arguments[-1][:, 0] = core.FAILED
-        else:
-            SOLVE(*arguments)
+            for values, kept in zip(state, before, strict=True):
+                values[:] = kept
+            arguments[9][:] = 0.0
+            arguments[9][:, 0] = core.FAILED
 
     monkeypatch.setattr(ladder, "solve", gives_up)
     run = torture.drive("reach", "all-on", 400)
@@ -160,8 +166,9 @@ def test_a_slow_solve_is_found_with_its_temperatures(monkeypatch, no_goals):
     slow = []
 
     def dawdles(*arguments):
-        start, end = arguments[3][0].copy(), arguments[5][0].copy()
+        start = arguments[3][0].copy()
         SOLVE(*arguments)
+        end = arguments[5][0].copy()
         if end.max() > 60.0 and not slow:
             slow.append((start, end))
             begun = time.thread_time()

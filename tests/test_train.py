@@ -32,7 +32,7 @@ def run(*arguments, cwd=ROOT, **options):
 def trained(tmp_path_factory):
     """A short run by the command line."""
     folder = tmp_path_factory.mktemp("runs") / "short"
-    done = run("--steps", 1200, "--seed", 3, "--episodes", 2, "--out", folder)
+    done = run("--algo", "sac", "--steps", 3264, "--seed", 3, "--episodes", 2, "--out", folder)
     assert done.returncode == 0, done.stderr
     return folder, done
 
@@ -42,7 +42,7 @@ def test_a_run_leaves_policy_curve_and_report(trained):
     for name in ("policy.zip", "policy.json", "last.zip", "replay_buffer.pkl", "curve.csv", "curve.png", "report.json"):
         assert (folder / name).stat().st_size > 0
     assert matplotlib.image.imread(folder / "curve.png").shape[0] > 400
-    assert steps_of(folder)[-1] == 1200
+    assert steps_of(folder)[-1] == 3264
     report = json.loads((folder / "report.json").read_text())
     assert set(report["held_out"]) == {"sac", "scripted", "random"}
     assert report["held_out"]["scripted"]["success_rate"] == 1.0
@@ -68,7 +68,7 @@ def test_a_run_can_be_watched_in_tensorboard(trained):
 
 def test_progress_is_shown(trained):
     _, done = trained
-    assert "1200/1,200" in (done.stdout + done.stderr).replace("1,200/1,200", "1200/1,200")
+    assert "3264/3,264" in (done.stdout + done.stderr).replace("3,264/3,264", "3264/3,264")
 
 
 def test_eval_only_repeats_the_reports_numbers(trained):
@@ -80,9 +80,9 @@ def test_eval_only_repeats_the_reports_numbers(trained):
 
 def test_resume_goes_on_with_its_seed(trained, tmp_path):
     folder = shutil.copytree(trained[0], tmp_path / "copy")
-    assert train.main(["--resume", str(folder), "--steps", "400", "--episodes", "1"]) == 0
+    assert train.main(["--resume", str(folder), "--steps", "384", "--episodes", "1"]) == 0
     steps = steps_of(folder)
-    assert steps == sorted(steps) and steps[-1] == 1600
+    assert steps == sorted(steps) and steps[-1] == 3648
     assert json.loads((folder / "report.json").read_text())["seed"] == 3
     assert json.loads((folder / "policy.json").read_text())["seed"] == 3
 
@@ -101,8 +101,8 @@ def steps_of(folder):
 
 def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint_to_its_end(quickly, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "killed"
-    often = "import sys, train; train.CURVE_EPISODES = 1; train.CURVE_INTERVAL = 200; train.main(sys.argv[1:])"
-    command = [sys.executable, "-c", often, "--steps", "1400", "--seed", "5", "--out", str(folder)]
+    often = "import sys, train; train.CURVE_EPISODES = 1; train.CURVE_INTERVAL = 320; train.main(sys.argv[1:])"
+    command = [sys.executable, "-c", often, "--algo", "sac", "--steps", "2240", "--seed", "5", "--out", str(folder)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
             while not (folder / "curve.csv").exists() or len(steps_of(folder)) < 4:
@@ -111,13 +111,13 @@ def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint_to_its_end(quick
         finally:
             process.kill()
     left = steps_of(folder)
-    assert left[:4] == [200, 400, 600, 800] and left[-1] < 1400 and not (folder / "report.json").exists()
+    assert left[:4] == [320, 640, 960, 1280] and left[-1] < 2240 and not (folder / "report.json").exists()
     assert quickly("--resume", folder) == 0
-    assert f"for {1400 - left[-1]} steps, seed 5" in capsys.readouterr().out
-    assert steps_of(folder) == [*left, 1400]
-    assert SAC.load(folder / "last.zip", device="cpu").num_timesteps == 1400
+    assert f"for {2240 - left[-1]} steps, seed 5" in capsys.readouterr().out
+    assert steps_of(folder) == [*left, 2240]
+    assert SAC.load(folder / "last.zip", device="cpu").num_timesteps == 2240
     with (folder / "replay_buffer.pkl").open("rb") as file:
-        assert pickle.load(file).size() >= 1400 // 4 - 1  # SB3 stores a step after it has told of it
+        assert pickle.load(file).size() >= 2240 // 32 - 1  # SB3 stores a step after it has told of it
     assert not list(folder.glob("new-*"))
 
 
@@ -130,7 +130,7 @@ def parameters(folder, name="policy.zip"):
 def test_the_same_command_makes_the_same_policy(trained, tmp_path):
     """Whatever else the process did before."""
     folder, again = trained[0], tmp_path / "again"
-    assert train.main(["--steps", "1200", "--seed", "3", "--episodes", "2", "--out", str(again)]) == 0
+    assert train.main(["--algo", "sac", "--steps", "3264", "--seed", "3", "--episodes", "2", "--out", str(again)]) == 0
     assert parameters(folder) == parameters(again)
     rows = []
     for place in (folder, again):
@@ -144,8 +144,8 @@ def test_the_same_command_makes_the_same_policy(trained, tmp_path):
 def test_ppo_trains_and_goes_on_without_a_replay_buffer(quickly, tmp_path):
     folder = tmp_path / "ppo"
     for arguments in (["--algo", "ppo", "--out", folder], ["--resume", folder]):
-        assert quickly(*arguments, "--steps", 2048) == 0
-    assert steps_of(folder)[-1] == 4096
+        assert quickly(*arguments, "--steps", 6400) == 0
+    assert steps_of(folder)[-1] == 12_800
 
 
 def test_dagger_imitates_the_controller_and_goes_on_with_its_record(quickly, tmp_path):
@@ -163,7 +163,7 @@ def test_dagger_imitates_the_controller_and_goes_on_with_its_record(quickly, tmp
 def test_a_fresh_run_leaves_nothing_of_an_earlier_one(tmp_path, monkeypatch):
     folder = tmp_path / "again"
     folder.mkdir()
-    for name in train.ARTEFACTS:
+    for name in ("policy.zip", "last.zip", "replay_buffer.pkl", "curve.csv", "report.json", "events.out.tfevents.17.host.3.0"):
         (folder / name).write_text("old")
     monkeypatch.setattr(train, "train", lambda *arguments: (0.0, True))
     assert train.main(["--out", str(folder)]) == 130
@@ -211,8 +211,7 @@ def test_ray_is_needed_for_its_engine_only(monkeypatch, capsys):
     ("arguments", "message"),
     [
         (["--task", "juggle"], "--task juggle: unknown; the tasks are reach, twist-align, pick-and-place"),
-        (["--algo", "dqn"], "--algo dqn: unknown; the algorithms are sac, ppo, dagger"),
-        (["--algo", "dagger"], "--algo dagger: not for the task 'reach', whose algorithms are sac, ppo"),
+        (["--algo", "dqn"], "--algo dqn: unknown; the algorithms are dagger, her, ppo, sac"),
         (["--steps", "0"], "--steps 0: expected a positive integer"),
         (["--episodes", "-3"], "--episodes -3: expected a positive integer"),
         (["--seed", "-1"], "--seed -1: expected an integer of at least 0"),
@@ -265,3 +264,11 @@ def test_a_broken_checkpoint_is_told(tmp_path, capsys):
     with pytest.raises(SystemExit):
         train.main(["--eval-only", str(folder)])
     assert "expected a sac policy" in capsys.readouterr().err
+
+
+def test_a_run_without_a_checkpoint_is_told(tmp_path, capsys):
+    (tmp_path / "policy.json").write_text('{"task": "reach", "algo": "sac"}')
+    with pytest.raises(SystemExit) as stop:
+        train.main(["--resume", str(tmp_path)])
+    assert stop.value.code == 2
+    assert "last.zip: not there; a run that ended before its first checkpoint" in capsys.readouterr().err

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import tca_envs  # noqa: F401
+from tca_envs import batch
 from tca_envs.mechanics import thermal
 from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT
 from tca_envs.tasks.core import STEP_S
@@ -63,7 +64,7 @@ def test_goals_come_from_their_split_and_are_all_reached_within_a_turn(split):
 )
 def test_success_takes_1_5_millimetres_and_5_degrees(achieved, success):
     task = TwistAlign("train")
-    assert bool(task.judge(achieved, goal()).success) is success
+    assert bool(batch.outcome(task, achieved, goal()).success) is success
     sparse = gym.make("TCATwistAlign-v0").unwrapped
     assert sparse.compute_reward(achieved, goal(), {}) == (0.0 if success else -1.0)
 
@@ -72,7 +73,7 @@ def test_success_takes_1_5_millimetres_and_5_degrees(achieved, success):
 def test_yaw_errors_do_not_depend_on_where_the_circle_is_cut(turn):
     task = TwistAlign("train")
     for error in (0.0, 3.0, -90.0, 179.0):
-        found = task.judge(goal(yaw=turn + error), goal(yaw=turn)).measures
+        found = batch.outcome(task, goal(yaw=turn + error), goal(yaw=turn)).measures
         assert found["yaw_error_deg"] == pytest.approx(abs(error), abs=1e-9)
 
 

@@ -13,9 +13,11 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 import tca_envs  # noqa: F401
-from tca_envs.mechanics import collocation, grasp
+from tca_envs.mechanics import grasp, kernels
 from tca_envs.tasks import core
+from tca_envs.tasks.pick_and_place import PickAndPlace
 from tca_envs.tasks.reach import Reach
+from tca_envs.tasks.twist_align import TwistAlign
 from tca_envs.vector import ArmVectorEnv
 
 IDS = sorted(name for name, spec in gym.registry.items() if "tca_envs" in str(spec.entry_point))
@@ -61,14 +63,14 @@ def failing(monkeypatch):
     """A solver that has no answer where the first TCA is hotter than 50 degC; goals are drawn without one."""
     solve = core.ladder.solve
 
-    def solve_or_fail(arm, strain, tension, drive, load, asked, new_load, tip, lengths, report):
+    def solve_or_fail(arm, strain, tension, drive, load, asked, new_load, tip, lengths, report, *rest):
         state = (strain, tension, drive, load, tip, lengths)
         before = [values.copy() for values in state]
-        solve(arm, *state[:4], asked, new_load, tip, lengths, report)
+        solve(arm, *state[:4], asked, new_load, tip, lengths, report, *rest)
         bad = asked[:, 0] > 50.0
         for values, kept in zip(state, before, strict=True):
             values[bad] = kept[bad]
-        report[bad] = (collocation.FAILED, 1.0, 7, 0, 0)
+        report[bad] = (kernels.FAILED, 1.0, 7, 0, 0)
 
     def draw(task, core, generators):
         return np.array([generator.random(3) for generator in generators]), np.empty((len(generators), 0))
@@ -184,26 +186,77 @@ def plain(info):
     return {key: plain(info[key]) if isinstance(info[key], dict) else np.asarray(info[key]).item() for key in sorted(info)}
 
 
-def test_what_is_returned_belongs_to_the_caller():
-    env = native()
-    chosen = actions(env, 10)
+def arrays(result):
+    """Yield all arrays of numbers in it."""
+    if isinstance(result, np.ndarray) and result.dtype != object:
+        yield result
+    elif isinstance(result, dict | tuple | list | np.ndarray):
+        for part in result.values() if isinstance(result, dict) else result:
+            yield from arrays(part)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_what_is_returned_belongs_to_the_caller(mode):
+    env = native(autoreset_mode=mode)
+    chosen = actions(env, 3 * EPISODE)
     kept = [env.reset(seed=0), *(env.step(action) for action in chosen)]
-    before = copy.deepcopy(kept)
+    before, twin = copy.deepcopy(kept), copy.deepcopy(env)
     env.step(chosen[0])
-    assert_same(tuple(kept), tuple(before))
-    twin = copy.deepcopy(env)
-    found = env.step(chosen[1])
-    for values in (
-        *found[0].values(),
-        *found[1:4],
-        found[4]["energy_J"],
-        found[4]["is_success"],
-        found[4]["solver"]["residual"],
-    ):
-        values[:] = 1
-    twin.step(chosen[1])
-    assert_same(env.step(chosen[2]), twin.step(chosen[2]))
-    assert env.step(chosen[3])[0]["observation"].base is None
+    twin.step(chosen[0])
+    assert_same(kept, before)
+    for result in kept:
+        mine = list(arrays(result))
+        assert all(values.base is None for values in mine)
+        for i, values in enumerate(mine):
+            assert not any(np.shares_memory(values, other) for other in mine[:i])
+            values[:] = 1
+    assert_same(env.step(chosen[1]), twin.step(chosen[1]))
+
+
+def test_lanes_that_start_anew_rest_meanwhile():
+    """Nothing that their past makes hard to solve is asked of the solver again."""
+    env = native()
+    env.reset(seed=0)
+    seen, step = [], env.task.step
+    env.task.step = lambda core, action: (seen.append((core.record.temperature.max(), action.max())), step(core, action))[1]
+    for action in actions(env, EPISODE + 1):
+        env.step(action)
+    assert min(seen[1:EPISODE])[0] > 25.0 and seen[EPISODE] == (25.0, -1.0)
+
+
+def test_each_lane_draws_until_it_is_content_and_then_no_more(monkeypatch):
+    """Drawn in rounds with others, each episode is what its generator makes of it alone, for all tasks."""
+    for task in (Reach("train"), TwistAlign("held-out"), PickAndPlace("train")):
+        arms, settle, rejected = task.core(1), core.Core.settle, []
+
+        def cool(arms, temperature, payload=None, settle=settle, rejected=rejected):
+            record, good = settle(arms, temperature, payload)
+            rejected.append((temperature[:, 0] > 70.0).sum())
+            return record, good & (temperature[:, 0] <= 70.0)
+
+        monkeypatch.setattr(core.Core, "settle", cool)
+        together, alone = ([np.random.default_rng(i) for i in range(12)] for _ in range(2))
+        goals, scenes = task.draw(arms, together)
+        assert len(rejected) > 1 and sum(rejected) > 3
+        for i, generator in enumerate(alone):
+            goal, scene = task.draw(arms, [generator])
+            assert goal.tobytes() == goals[i].tobytes() and scene.tobytes() == scenes[i].tobytes()
+            assert generator.random() == together[i].random()
+        monkeypatch.setattr(core.Core, "settle", settle)
+
+
+def test_an_arm_that_falls_on_the_way_is_not_settled(monkeypatch):
+    arms, solve, calls = Reach("train").core(1), core.ladder.solve, []
+
+    def falls_once(*arguments):
+        solve(*arguments)
+        calls.append(arguments)
+        arguments[9][1, 3] = len(calls) == 2  # of the report
+
+    monkeypatch.setattr(core.ladder, "solve", falls_once)
+    record, good = arms.settle(np.full((3, 3), 60.0))
+    assert good.tolist() == [True, False, True] and len(calls) == len(core.RAMP)
+    np.testing.assert_array_equal(record.temperature, 60.0)
 
 
 @pytest.mark.parametrize("name", ["TCAReach-v0", "TCAPickAndPlace-v0"])

@@ -41,7 +41,8 @@ def read() -> dict[str, dict[str, dict[str, Any]]]:
 
 HYPERPARAMETERS = read()
 ALGORITHMS = tuple(dict.fromkeys(algorithm for entries in HYPERPARAMETERS.values() for algorithm in entries))
-"""Learners that `train.py` offers: Stable-Baselines3's, and imitation of the scripted controller (`agents.dagger`)."""
+"""Learners that `train.py` offers: PPO and SAC of Stable-Baselines3, the latter also with hindsight experience replay on the
+sparse rewards ("her"), and imitation of the scripted controller (`agents.dagger`)."""
 
 
 def for_learner(settings: dict[str, Any]) -> dict[str, Any]:

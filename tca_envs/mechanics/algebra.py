@@ -8,7 +8,6 @@ A matrix is its nine numbers, row by row. A quaternion is (w, x, y, z).
 
 from typing import Any
 
-import numpy as np
 from numba import njit
 
 # Not nnan or ninf: overflow must stay visible.
@@ -20,10 +19,17 @@ OPTIONS: dict[str, Any] = {
     "no_cfunc_wrapper": True,
 }
 INNER: dict[str, Any] = {"no_cpython_wrapper": True, **OPTIONS}
+ORIGIN = (0.0, 0.0, 0.0)
+CALLED: dict[str, Any] = {name: OPTIONS[name] for name in ("cache", "error_model", "fastmath")}
+"""Options of kernels that are called by address."""
 entry = njit(**OPTIONS)
 """Decorator of kernels that Python calls."""
+parallel = njit(parallel=True, **OPTIONS)
+"""Decorator of kernels that Python calls and that share their work among threads."""
 inner = njit(**INNER)
 """Decorator of kernels that only kernels call: without wrappers they compile faster."""
+merged = njit(inline="always", **INNER)
+"""Decorator of kernels that one kernel calls: they become part of it before anything is compiled."""
 _small = njit(forceinline=True, **INNER)
 
 
@@ -173,20 +179,6 @@ def inverse(a):
         d * c3, d * (a[0] * a[8] - a[2] * a[6]), d * (a[2] * a[3] - a[0] * a[5]),
         d * c6, d * (a[1] * a[6] - a[0] * a[7]), d * (a[0] * a[4] - a[1] * a[3]),
     )  # fmt: skip
-
-
-@_small
-def negatives(a):
-    """Return how many eigenvalues of a symmetric matrix are negative, by Descartes' rule; 3 if it is not finite."""
-    trace = a[0] + a[4] + a[8]
-    minors = a[0] * a[4] - a[1] * a[3] + a[0] * a[8] - a[2] * a[6] + a[4] * a[8] - a[5] * a[7]
-    det = a[0] * (a[4] * a[8] - a[5] * a[7]) - a[1] * (a[3] * a[8] - a[5] * a[6]) + a[2] * (a[3] * a[7] - a[4] * a[6])
-    if trace > 0.0 and minors > 0.0 and det > 0.0:
-        return 0
-    if not abs(det) < np.inf:
-        return 3
-    first, second, third = trace < 0.0, minors < 0.0, det < 0.0
-    return (1 if first else 0) + (1 if first != second else 0) + (1 if second != third else 0)
 
 
 @_small

@@ -6,30 +6,15 @@ from dataclasses import dataclass, field
 from functools import cache, cached_property
 from math import ceil, hypot
 from operator import index as as_integer
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tca_envs.mechanics import check, closed_form, collocation, ladder, section
-from tca_envs.mechanics.collocation import (
-    CLOSED_FORM,
-    DESCENT,
-    FAILED,
-    FINER,
-    JACOBIAN,
-    LOAD,
-    PAYLOAD_MASS,
-    REPORT,
-    SHAPE,
-    SUBSTEPS,
-    WARM,
-    Model,
-    compile_kernels,
-    linearise,
-    solve_lanes,
-)
+from tca_envs.mechanics import check, closed_form, kernels, ladder, section
+from tca_envs.mechanics.collocation import JACOBIAN, SHAPE, Model, compile_kernels, flat, linearise, solve_lanes
 from tca_envs.mechanics.equilibrium import Equilibrium, Rung
+from tca_envs.mechanics.kernels import CLOSED_FORM, DESCENT, FAILED, FINER, LOAD, PAYLOAD_MASS, REPORT, SUBSTEPS, WARM
 from tca_envs.mechanics.ladder import TIME_LIMIT_S, Lane
 from tca_envs.mechanics.muscle import PARAMETERS, Muscle
 
@@ -380,7 +365,7 @@ class Arm:
         return lane if other is self else lane._replace(strain=carried(self.grids, lane.strain, other.grids))
 
     def load(self, tip_force: ArrayLike = ZERO, tip_moment: ArrayLike = ZERO, payload: Payload | None = None) -> Array:
-        """Return the external load as the flat array of `collocation.LOAD` numbers that the kernels read."""
+        """Return the external load as the flat array of `kernels.LOAD` numbers that the kernels read."""
         load = self._load.copy()
         if payload is not None:
             load[PAYLOAD_MASS:] = _flat(payload)
@@ -461,7 +446,7 @@ class Arm:
                 message, on, lane = climbed.message, climbed.arm, climbed.lane
                 tip[0], lengths[0], iterations = climbed.tip, climbed.lengths, report[0, 2] + climbed.iterations
                 report[0, :4] = climbed.rung, climbed.residual, iterations, climbed.jumped
-            elif report[0, 0] == SUBSTEPS or report[0, 4] > ladder.LONG:
+            elif report[0, 0] == SUBSTEPS or report[0, 4] > ladder.DOUBT:
                 here = self.unloaded() if start is None else self.restart(start)
                 report[0, 3] = not ladder.returns(self.model, lane, here, begun + time_limit_s)
         rung, residual, iterations, jumped, _ = report[0].tolist()
@@ -504,7 +489,7 @@ class Arm:
             return False
         # Where nothing pushes the energy is convex; but a muscle may, and a coarse grid may not hold the shape.
         strain, tension, at_drive, at_load = (values[0] for values in found)
-        if ladder.negative_eigenvalues(self.model, strain, tension, at_drive, at_load, collocation.NEUTRAL):
+        if ladder.negative_eigenvalues(self.model, strain, tension, at_drive, at_load, kernels.NEUTRAL):
             return False
         for values, new in zip(lane, found, strict=True):
             values[...] = new[0]
@@ -700,7 +685,7 @@ def _compile(modules: tuple[Module, ...], grids: tuple[Grid, ...], tolerance: fl
         arc.append(base + module.length * x)
         base += module.length
     muscles = [(module, muscle) for module in modules for muscle in module.muscles]
-    model = Model(
+    fields: dict[str, Any] = dict(
         elements=np.array([grid.elements for grid in grids], dtype=np.int64),
         nodes=np.array([grid.nodes for grid in grids], dtype=np.int64),
         length=np.array([module.length for module in modules]),
@@ -715,6 +700,6 @@ def _compile(modules: tuple[Module, ...], grids: tuple[Grid, ...], tolerance: fl
         parameters=np.array([muscle.law.parameters() for _, muscle in muscles]).reshape(-1, PARAMETERS),
         rest_length=np.array([module.rest_length(muscle) for module, muscle in muscles]),
         tolerance=tolerance,
-        ladder=True,
     )
-    return model, np.concatenate(arc)
+    f, i = flat(**fields)
+    return Model(**fields, ladder=True, f=f, i=i), np.concatenate(arc)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tca_envs.mechanics.algebra import entry, inner
-from tca_envs.mechanics.collocation import CLOSED_FORM
+from tca_envs.mechanics.kernels import CLOSED_FORM
 from tca_envs.mechanics.muscle import TENDON, elongation
 
 Array = NDArray[np.float64]

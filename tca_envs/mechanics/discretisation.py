@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from tca_envs.mechanics import check, ladder
 from tca_envs.mechanics.arm import MAX_NODES, Arm, Grid, Module, carried
-from tca_envs.mechanics.collocation import FAILED, LOAD, REPORT, solve_lanes
+from tca_envs.mechanics.collocation import solve_lanes
+from tca_envs.mechanics.kernels import FAILED, LOAD, REPORT
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tca_envs.mechanics import check, collocation
+from tca_envs.mechanics import check, kernels
 from tca_envs.mechanics.collocation import Model
 
 Array = NDArray[np.float64]
@@ -17,17 +17,17 @@ Array = NDArray[np.float64]
 class Rung(IntEnum):
     """Which rung of the ladder answered; each is tried where the one before fails."""
 
-    WARM = collocation.WARM
+    WARM = kernels.WARM
     """Newton straight from the start."""
-    SUBSTEPS = collocation.SUBSTEPS
+    SUBSTEPS = kernels.SUBSTEPS
     """Newton in substeps of drive and load."""
-    FINER = collocation.FINER
+    FINER = kernels.FINER
     """The same on a grid of twice the elements."""
-    DESCENT = collocation.DESCENT
+    DESCENT = kernels.DESCENT
     """The start's branch ends: a fall down the hill of the total energy, and on from there."""
-    FAILED = collocation.FAILED
+    FAILED = kernels.FAILED
     """None."""
-    CLOSED_FORM = collocation.CLOSED_FORM
+    CLOSED_FORM = kernels.CLOSED_FORM
     """Nothing loads the arm."""
 
 
@@ -118,7 +118,7 @@ class Equilibrium:
     @property
     def stable(self) -> bool:
         """Whether this equilibrium is stable: `stability` > 0; or 0 within 1e-5, as where an arm can turn without any work."""
-        return self.stability > -collocation.NEUTRAL
+        return self.stability > -kernels.NEUTRAL
 
     def _arc(self, s: ArrayLike) -> Array:
         positions = check.array("s", [s] if isinstance(s, int | float) else s, (None,))

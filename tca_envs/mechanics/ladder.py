@@ -13,23 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs.mechanics.collocation import (
-    DESCENT,
-    FAILED,
-    FINER,
-    GIVEN,
-    INERTIA,
-    NEUTRAL,
-    REPORT,
-    SMALLEST_SUBSTEP,
-    STEP,
-    SUBSTEPS,
-    WARM,
-    Model,
-    compile_kernels,
-    linearise,
-    solve_lanes,
-)
+from tca_envs.mechanics.collocation import GIVEN, INERTIA, STEP, Heat, Model, compile_kernels, linearise, solve_lanes
+from tca_envs.mechanics.kernels import DESCENT, FAILED, FINER, NEUTRAL, REPORT, SMALLEST_SUBSTEP, SUBSTEPS, WARM
 
 if TYPE_CHECKING:
     from tca_envs.mechanics.arm import Arm
@@ -45,8 +30,8 @@ PAST = 1.0 / 256.0
 MAX_FALLS = 12
 ALIKE = 0.1
 """Strains that differ by less, curvature times the arm's length [rad] and stretch, are taken for those of the same branch."""
-LONG = 0.25
-"""A step whose first Newton step is longer, rotation [rad] and stretch, or that takes substeps, is checked by going back."""
+DOUBT = 0.2
+"""A solve by long Newton steps that do not shrink by this factor, or by substeps, is checked by going back."""
 MAX_DESCENT = 300
 """Steps of one fall."""
 FALL_STEP = 0.3
@@ -201,7 +186,7 @@ def climb(
 
 def solve(
     arm: "Arm", strain: Array, tension: Array, from_drive: Array, from_load: Array, drive: Array, load: Array, tip: Array,
-    lengths: Array, report: Array,
+    lengths: Array, report: Array, threads: int = 1, heat: Heat | None = None,
 ) -> None:  # fmt: skip
     """Solve N lanes of an arm, each by the whole ladder, within `TIME_LIMIT_S` each.
 
@@ -211,16 +196,17 @@ def solve(
     compile_kernels()
     start = (strain.copy(), tension.copy(), from_drive.copy(), from_load.copy())
     lanes = (strain, tension, from_drive, from_load)
-    solve_lanes(arm.model, *lanes, drive, load, tip, lengths, report)
-    if not ((report[:, 0] != WARM) | (report[:, 4] > LONG)).any():
+    solve_lanes(arm.model, *lanes, drive, load, tip, lengths, report, 1.0, threads, heat)
+    if not ((report[:, 0] != WARM) | (report[:, 4] > DOUBT)).any():
         return
-    long = (report[:, 0] == SUBSTEPS) | (report[:, 4] > LONG)
+    long = (report[:, 0] == SUBSTEPS) | (report[:, 4] > DOUBT)
     for i in np.flatnonzero(long & (report[:, 0] != FAILED)):
         known, there = (Lane(*(values[i] for values in kind)) for kind in (start, lanes))
         report[i, 3] = not returns(arm.model, there, known, time.perf_counter() + TIME_LIMIT_S)
+    n = tension.shape[1]
     for i in np.flatnonzero(report[:, 0] == FAILED):
         known, stuck = (Lane(*(values[i].copy() for values in kind)) for kind in (start, lanes))
-        found = climb(arm, known, stuck, drive[i], load[i], report[i, 3], time.perf_counter(), TIME_LIMIT_S)
+        found = climb(arm, known, stuck, drive[i, :n], load[i], report[i, 3], time.perf_counter(), TIME_LIMIT_S)
         report[i, :4] = found.rung, found.residual, report[i, 2] + found.iterations, found.jumped
         answer = known
         if found.rung != FAILED:
@@ -341,6 +327,8 @@ def _pushed_off(model: Model, strain: Array, tension: Array, drive: Array, load:
         numbers, *_, bend, shear, _ = linearise(
             model, strain, tension.copy(), drive, load, damping, False, GIVEN, -stiffness * mode
         )
+        if not 0.0 < numbers[4] < np.inf:  # no tangent to speak of: off along what there is
+            break
         mode = np.hstack([bend, shear])
         mode *= NUDGE / numbers[4]
     return strain + mode

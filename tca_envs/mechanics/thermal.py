@@ -108,6 +108,17 @@ def power_to_reach(temperature: ArrayLike, target: ArrayLike, duration: float, h
     return heating.loss * (end - heating.ambient)
 
 
+def constants(duration: float, limit: float, heating: Heating) -> Array:
+    """Return the numbers (6, n) with which `kernels.heat` steps temperatures that never exceed `limit` [degC].
+
+    Shares of heat kept and lost in a step of `duration` [s], loss [W/K], full power [W], ambient and limit [degC].
+    """
+    exponent = -_duration(duration) * heating.loss / heating.capacity
+    return np.array(
+        np.broadcast_arrays(np.exp(exponent), -np.expm1(exponent), heating.loss, heating.max_power, heating.ambient, limit)
+    )
+
+
 def time_to_reach(temperature: ArrayLike, target: ArrayLike, heating: Heating) -> Array:
     """Return the shortest time [s] in which a heater takes `temperature` (..., n) to `target` (..., n) [degC].
 

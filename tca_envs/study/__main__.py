@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from tca_envs.study import ablation, output, paper, size, speed_accuracy, stability, tolerance
+from tca_envs.study import ablation, output, paper, size, speed_accuracy, stability, throughput, tolerance
 from tca_envs.study.scenes import SCENES
 
 
@@ -58,6 +58,12 @@ STUDIES = {
     "size": Study(
         lambda options: size.run(options.out, options.quick),
         "chart the time of a solve against modules, muscles and lanes",
+        ("matplotlib", "tqdm"),
+        _add_quick,
+    ),
+    "throughput": Study(
+        lambda options: throughput.run(options.out, options.quick),
+        "chart environment steps per second against the number of environments; tell memory and the time of a first step",
         ("matplotlib", "tqdm"),
         _add_quick,
     ),

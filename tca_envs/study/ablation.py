@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from tca_envs import presets
 from tca_envs.mechanics import Arm, Equilibrium, Grid, closed_form, discretise
 from tca_envs.mechanics.arm import default_grid
-from tca_envs.mechanics.collocation import FAILED, REPORT, solve_lanes
+from tca_envs.mechanics.collocation import solve_lanes
+from tca_envs.mechanics.kernels import FAILED, REPORT
 from tca_envs.mechanics.rotation import yaw_angle
 from tca_envs.mechanics.thermal import AMBIENT
 from tca_envs.study import output

@@ -37,7 +37,7 @@ class State:
 
     @cached_property
     def load(self) -> Array:
-        """Everything that loads the arm, as the flat array of `collocation.LOAD` numbers."""
+        """Everything that loads the arm, as the flat array of `kernels.LOAD` numbers."""
         return self.arm.load(self.tip_force, payload=self.payload)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tca_envs import presets
 from tca_envs.mechanics import Arm, Grid, Module, Muscle, Payload, Tendon
-from tca_envs.mechanics.collocation import PAYLOAD_MASS
+from tca_envs.mechanics.kernels import PAYLOAD_MASS
 from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT
 from tca_envs.study.method import State
 

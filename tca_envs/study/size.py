@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from tca_envs import presets
 from tca_envs.mechanics import TCA, Arm, Grid, Muscle
-from tca_envs.mechanics.collocation import FAILED, REPORT, solve_lanes
+from tca_envs.mechanics.collocation import solve_lanes
+from tca_envs.mechanics.kernels import FAILED, REPORT
 from tca_envs.study import output
 from tca_envs.study.timing import no_collection
 

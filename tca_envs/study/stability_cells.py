@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tca_envs import presets
 from tca_envs.mechanics import Arm, Equilibrium, Grid, Module, Muscle, Payload, Tendon
-from tca_envs.mechanics.collocation import PAYLOAD_MASS
+from tca_envs.mechanics.kernels import PAYLOAD_MASS
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
 from tca_envs.study.method import State
 from tca_envs.study.reference import NoReference, reference

@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 
 from tca_envs.mechanics import Arm, Equilibrium, section
 from tca_envs.mechanics.arm import pose
-from tca_envs.mechanics.collocation import PAYLOAD_MASS
+from tca_envs.mechanics.kernels import PAYLOAD_MASS
 from tca_envs.mechanics.ladder import smallest_eigenvalue
 from tca_envs.mechanics.shooting import quaternion_rate
 from tca_envs.study.method import Answer, State

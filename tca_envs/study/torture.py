@@ -15,9 +15,10 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs import presets
+from tca_envs import batch, presets
 from tca_envs.mechanics import Rung, ladder, thermal
-from tca_envs.mechanics.collocation import REPORT, SHAPE, linearise, solve_lanes
+from tca_envs.mechanics.collocation import SHAPE, Heat, linearise, solve_lanes
+from tca_envs.mechanics.kernels import REPORT
 from tca_envs.mechanics.ladder import Lane
 from tca_envs.study import output
 from tca_envs.study.scenes import IDS
@@ -184,16 +185,21 @@ class Watched(Core):
         self.longest = 0
         self.failed: list[Asked] = []
 
-    def _solve(self, record: Record, temperature: Array) -> Array:
+    def _solve(self, record: Record, temperature: Array, heat: Heat | None = None) -> Array:
         reports = []
         for lane in range(len(temperature)):
             rows = slice(lane, lane + 1)
             one = Record(*(getattr(record, f.name)[rows] for f in fields(Record)))
             start = one.drive[0].copy()
+            warmth = (
+                None
+                if heat is None
+                else heat._replace(action=heat.action[rows], temperature=heat.temperature[rows], power=heat.power[rows])
+            )
             wall, cpu = time.perf_counter_ns(), time.thread_time_ns()
-            report = super()._solve(one, temperature[rows])
+            report = super()._solve(one, temperature[rows], warmth)
             cpu, wall = time.thread_time_ns() - cpu, time.perf_counter_ns() - wall
-            asked = Asked(start, temperature[lane, : start.size], float(one.payload[0, 0]))
+            asked = Asked(start, temperature[lane, : start.size].copy(), float(one.payload[0, 0]))
             if self.slowest is None or cpu > self.longest:
                 self.slowest, self.longest = asked, cpu
             if not solved(report).all():
@@ -276,7 +282,7 @@ def drive(name: str, policy: str, steps: int, progress: Callable[[Iterable[int]]
             age += 1
             over = (age == episode) | ~solved(told)
             change.append(np.linalg.norm(record.temperature - before, axis=1))
-            numbers = [*task.observe(core), *(getattr(record, f.name) for f in fields(Record))]
+            numbers = [*batch.look(task, core, told)[0].values(), *(getattr(record, f.name) for f in fields(Record))]
             finite.append(np.all([np.isfinite(n.reshape(LANES, -1)).all(axis=1) for n in numbers], axis=0))
             rare = np.isin(told[:, 0], (Rung.FINER, Rung.DESCENT))
             if i % SAMPLED == 0:

@@ -22,6 +22,7 @@ from scipy.integrate import DOP853
 from tca_envs.mechanics import Arm, Module
 from tca_envs.mechanics.algebra import (
     INNER,
+    ORIGIN,
     apply,
     apply_transposed,
     axpy,
@@ -39,7 +40,7 @@ from tca_envs.mechanics.algebra import (
     scalar_matrix,
     transpose,
 )
-from tca_envs.mechanics.collocation import ORIGIN, PAYLOAD_MASS
+from tca_envs.mechanics.kernels import PAYLOAD_MASS
 
 Array = NDArray[np.float64]
 

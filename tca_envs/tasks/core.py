@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tca_envs.mechanics import Arm, ladder, thermal
-from tca_envs.mechanics.collocation import FAILED, PAYLOAD_MASS, REPORT
+from tca_envs.mechanics.collocation import Heat
+from tca_envs.mechanics.kernels import FAILED, LOAD, PAYLOAD_MASS, REPORT
 from tca_envs.mechanics.thermal import HARD_LIMIT, Heater
 
 Array = NDArray[np.float64]
@@ -21,8 +22,9 @@ STEP_S = 0.1
 CUT_OFF = HARD_LIMIT - 2.0
 """Temperature [degC] that the heaters' firmware never lets a TCA exceed."""
 
-RAMP = 3
-"""Steps in which `Core.settle` heats; with fewer, the solver more often doubts that it is on the branch that it began on."""
+RAMP = (0.33, 0.67, 0.99, 1.0)
+"""Shares of the way in which `Core.settle` heats: with fewer, the solver more often doubts that it is on the branch that it
+began on; the last one is short, so that what is left of Newton's residual is little."""
 
 
 @dataclass
@@ -96,6 +98,8 @@ class Core:
         self.arm = arm
         self.threads = 1  # that share the lanes
         self.heating = heater.scaled(np.append(arm.rest_lengths, others))
+        self._heating = thermal.constants(STEP_S, CUT_OFF, self.heating)
+        self._load = arm.load()
         self.rest, self.rest_report = self._rest(goal_size, scene_size)
         self.record = self.rest.rows(np.zeros(lanes, dtype=np.intp))
 
@@ -122,18 +126,24 @@ class Core:
             raise RuntimeError(f"the arm has no equilibrium at {self.heating.ambient:g} degC to start from")
         return record, report
 
-    def _solve(self, record: Record, temperature: Array) -> Array:
-        """Bring lanes to equilibrium at `temperature`; where there is none, keep them as they are. Returns (N, REPORT)."""
+    def _solve(self, record: Record, temperature: Array, heat: Heat | None = None) -> Array:
+        """Bring lanes to equilibrium at `temperature` (N, m), or at what `heat` makes of it; returns the report (N, REPORT).
+
+        Where there is none, they stay as they are.
+        """
         report = np.empty((len(temperature), REPORT))
-        load = np.repeat(self.arm.load()[np.newaxis], len(temperature), axis=0)
+        load = np.empty((len(temperature), LOAD))
+        load[:] = self._load
         load[:, PAYLOAD_MASS:] = record.payload
-        drive = np.ascontiguousarray(temperature[:, : record.drive.shape[1]])
         ladder.solve(
-            self.arm, record.strain, record.tension, record.drive, record.load, drive, load,
-            record.tip, record.length, report,
+            self.arm, record.strain, record.tension, record.drive, record.load, temperature, load,
+            record.tip, record.length, report, self.threads, heat,
         )  # fmt: skip
         good = solved(report)
         record.temperature[good] = temperature[good]
+        if heat is not None:
+            record.power[good] = heat.power[good]
+            record.energy[good] += heat.power[good].sum(axis=1) * STEP_S
         return report
 
     def reset(self, lanes: NDArray[np.intp], goals: Array | float, scenes: Array | float) -> None:
@@ -155,15 +165,10 @@ class Core:
         (N, REPORT) array
             Rung, residual, iterations and jumped of the solver, see `Equilibrium`. A lane without equilibrium stays as it was.
         """
-        record, heating = self.record, self.heating
-        asked = 0.5 * (np.clip(action, -1.0, 1.0) + 1.0) * heating.max_power
-        allowed = thermal.power_to_reach(record.temperature, CUT_OFF, STEP_S, heating)
-        power = np.minimum(asked, np.maximum(allowed, 0.0))
-        report = self._solve(record, thermal.step(record.temperature, power, STEP_S, heating))
-        good = solved(report)
-        record.power[good] = power[good]
-        record.energy[good] += power[good].sum(axis=1) * STEP_S
-        return report
+        record = self.record
+        power, temperature = np.empty_like(record.power), np.empty_like(record.temperature)
+        action = np.ascontiguousarray(action, dtype=np.float64)
+        return self._solve(record, temperature, Heat(action, record.temperature, power, self._heating))
 
     def settle(self, temperature: Array, payload: Array | None = None) -> tuple[Record, NDArray[np.bool_]]:
         """Heat arms from rest to steady temperatures, as constant powers do.
@@ -190,7 +195,7 @@ class Core:
         record = self.rest.rows(np.zeros(lanes, dtype=np.intp))
         if payload is not None:
             record.payload[:] = payload
-        for done in np.arange(1, RAMP + 1) / RAMP:
+        for done in RAMP:
             report = self._solve(record, self.heating.ambient + done * (target - self.heating.ambient))
             good &= solved(report) & (report[:, 3] == 0.0)
         return record, good

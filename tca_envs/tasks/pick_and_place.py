@@ -13,7 +13,7 @@ from tca_envs.mechanics import grasp
 from tca_envs.mechanics.rotation import yaw, yaw_angle
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT, Heater
 from tca_envs.tasks.core import STEP_S, Core, Record, solved
-from tca_envs.tasks.task import Array, Mask, Outcome, Single, Task, box_with_heat, distance, observed, rounds
+from tca_envs.tasks.task import Array, Mask, Outcome, Single, Task, box_with_heat, rounds
 
 SUCCESS_CM = 0.3
 """An object at rest within 3 mm of the target, the gripper clear of it, is placed."""
@@ -200,29 +200,28 @@ class PickAndPlace(Task):
     def achieved(self, record: Record) -> Array:
         """Return what is compared with the goal (N, 4): object position [cm] and whether it lies there free."""
         scene = record.scene
-        return np.column_stack([100.0 * scene[:, grasp.X : grasp.Z + 1], scene[:, grasp.TOUCHED] < 0.5])
+        result = np.empty((len(scene), 4))
+        result[:, :3] = 100.0 * scene[:, grasp.X : grasp.Z + 1]
+        result[:, 3] = scene[:, grasp.TOUCHED] < 0.5
+        return result
 
-    def observe(self, core: Core) -> tuple[Single, Single]:
-        """Return what a controller measures (N, 23), and the object's position [cm] and whether it lies there free (N, 4)."""
+    def observe(self, core: Core, achieved: Single, result: Single) -> None:
+        """Write into `result` (N, 23) what a controller measures beside the heat."""
         record, scene = core.record, core.record.scene
-        result, lying = observed(core, 23), self.achieved(record).astype(np.float32)
-        between = (scene[:, grasp.HELD] > 0.5) | (scene[:, grasp.ASTRIDE] > 0.5)
-        gap = self.gap(record)
+        between = scene[:, grasp.HELD] + scene[:, grasp.ASTRIDE]  # 0 or 1: never both
+        turn = 2.0 * scene[:, grasp.YAW]
         place = tool(record)
         place[:, 2] += scene[:, grasp.STAGE]
         result[:, TOOL] = 100.0 * place
         result[:, TOOL_COS], result[:, TOOL_SIN] = yaw(record.tip)
         result[:, TRAVEL] = scene[:, grasp.STAGE] / presets.STAGE_TRAVEL
-        result[:, OPENING] = 100.0 * np.where(between, np.maximum(gap, presets.OBJECT.width), gap)
-        result[:, FORCE] = np.where(between, self.pinch(record), 0.0) / FULL_FORCE
-        result[:, OBJECT] = lying[:, :3]
-        result[:, OBJECT_COS2] = np.cos(2.0 * scene[:, grasp.YAW])
-        result[:, OBJECT_SIN2] = np.sin(2.0 * scene[:, grasp.YAW])
-        return result, lying
+        result[:, OPENING] = 100.0 * np.maximum(self.gap(record), presets.OBJECT.width * between)
+        result[:, FORCE] = self.pinch(record) * between / FULL_FORCE
+        result[:, OBJECT] = achieved[:, :3]
+        result[:, OBJECT_COS2], result[:, OBJECT_SIN2] = np.cos(turn), np.sin(turn)
 
-    def judge(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Outcome:
+    def judge(self, achieved: NDArray[Any], desired: NDArray[Any], away: Array) -> Outcome:
         """Return what is to be said of goals (..., 4)."""
-        away = distance(achieved, desired)
         return Outcome((away <= SUCCESS_CM) & (achieved[..., 3] > 0.5), -away, {"distance_mm": 10.0 * away})
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tca_envs import presets
 from tca_envs.mechanics.thermal import Heater
 from tca_envs.tasks.core import Core, Record
-from tca_envs.tasks.task import Array, Outcome, Single, Task, box_with_heat, distance, observed, steady_goals
+from tca_envs.tasks.task import Array, Outcome, Single, Task, box_with_heat, steady_goals
 
 SUCCESS_CM = 0.1
 """A tip within 1 mm of the goal has reached it."""
@@ -102,13 +102,10 @@ class Reach(Task):
         """Return what is compared with the goal (N, 3): tip position [cm]."""
         return 100.0 * record.tip[:, :3, 3]
 
-    def observe(self, core: Core) -> tuple[Single, Single]:
-        """Return what a controller measures (N, 9) and the tip's position (N, 3) [cm]."""
-        result, tip = observed(core, 9), self.achieved(core.record).astype(np.float32)
-        result[:, 6:] = tip
-        return result, tip
+    def observe(self, core: Core, achieved: Single, result: Single) -> None:
+        """Write into `result` (N, 9) what a controller measures beside the heat."""
+        result[:, 6:] = achieved
 
-    def judge(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Outcome:
+    def judge(self, achieved: NDArray[Any], desired: NDArray[Any], away: Array) -> Outcome:
         """Return what is to be said of goals (..., 3)."""
-        away = distance(achieved, desired)
         return Outcome(away <= SUCCESS_CM, -away, {"distance_mm": 10.0 * away})

@@ -75,12 +75,15 @@ class Task(ABC):
         """Return what is compared with the goal (N, k)."""
 
     @abstractmethod
-    def observe(self, core: Core) -> tuple[Single, Single]:
-        """Return what a controller measures (N, o) and what is compared with the goal (N, k)."""
+    def observe(self, core: Core, achieved: Single, result: Single) -> None:
+        """Write into `result` (N, o) what a controller measures; that of the m heated TCAs, 2 m numbers, is there already.
+
+        `achieved` (N, k) is what is compared with the goal.
+        """
 
     @abstractmethod
-    def judge(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Outcome:
-        """Return what is to be said of goals (..., k)."""
+    def judge(self, achieved: NDArray[Any], desired: NDArray[Any], away: Array) -> Outcome:
+        """Return what is to be said of goals (..., k); `away` (...,) is the distance of their first three numbers."""
 
     def of_this_split(self, temperature: Sequence[float]) -> bool:
         """Return whether goals at `temperature` (n,) [degC] belong to this task's split."""
@@ -137,28 +140,11 @@ def held_out(temperature: Sequence[float]) -> bool:
     return sum(floor((t - AMBIENT) / CELL_K) * (i % 4 + 1) for i, t in enumerate(temperature)) % 5 == 0
 
 
-def observed(core: Core, count: int) -> Single:
-    """Return observations (N, count) of which the first 2 m numbers are filled: what is measured of the m heated TCAs.
-
-    These are temperatures from 0 (25 degC) to 1 (150 degC), then powers from 0 to 1.
-    """
-    temperature, power = core.record.temperature, core.record.power
-    lanes, muscles = temperature.shape
-    result = np.empty((lanes, count), dtype=np.float32)
-    result[:, :muscles] = (temperature - AMBIENT) / (SOFT_LIMIT - AMBIENT)
-    result[:, muscles : 2 * muscles] = power / core.heating.max_power
-    return result
-
-
-def distance(achieved: NDArray[Any], desired: NDArray[Any]) -> Array:
-    """Return the distance of the first three coordinates over the last axis, in double precision."""
-    apart = achieved.astype(np.float64) - desired
-    x, y, z = apart[..., 0], apart[..., 1], apart[..., 2]
-    return np.asarray(np.sqrt(x * x + y * y + z * z))
-
-
 def box_with_heat(count: int, low: list[float], high: list[float]) -> spaces.Box:
-    """Return the space of `observed` for `count` TCAs, followed by numbers from `low` to `high`."""
+    """Return the space of observations: of `count` heated TCAs, followed by numbers from `low` to `high`.
+
+    Temperatures go from 0 (25 degC) to 1 (150 degC), powers from 0 to 1.
+    """
     return spaces.Box(
         np.array([0.0] * (2 * count) + low, dtype=np.float32),
         np.array([HOTTEST] * count + [1.0] * count + high, dtype=np.float32),

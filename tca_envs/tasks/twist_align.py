@@ -11,7 +11,7 @@ from tca_envs import presets
 from tca_envs.mechanics.rotation import yaw
 from tca_envs.mechanics.thermal import Heater
 from tca_envs.tasks.core import Core, Record
-from tca_envs.tasks.task import Array, Outcome, Single, Task, box_with_heat, distance, observed, steady_goals
+from tca_envs.tasks.task import Array, Outcome, Single, Task, box_with_heat, steady_goals
 
 SUCCESS_CM = 0.15
 """A tip within 1.5 mm of the goal is over it ..."""
@@ -112,20 +112,20 @@ class TwistAlign(Task):
 
     def achieved(self, record: Record) -> Array:
         """Return what is compared with the goal (N, 5): tip position [cm], cosine and sine of its yaw."""
-        return np.column_stack([100.0 * record.tip[:, :3, 3], *yaw(record.tip)])
+        result = np.empty((len(record.tip), 5))
+        result[:, :3] = 100.0 * record.tip[:, :3, 3]
+        result[:, 3], result[:, 4] = yaw(record.tip)
+        return result
 
-    def observe(self, core: Core) -> tuple[Single, Single]:
-        """Return what a controller measures (N, 13), and tip position [cm], cosine and sine of the yaw (N, 5)."""
-        result, pose = observed(core, 13), self.achieved(core.record).astype(np.float32)
-        result[:, 8:] = pose
-        return result, pose
+    def observe(self, core: Core, achieved: Single, result: Single) -> None:
+        """Write into `result` (N, 13) what a controller measures beside the heat."""
+        result[:, 8:] = achieved
 
-    def judge(self, achieved: NDArray[Any], desired: NDArray[Any]) -> Outcome:
+    def judge(self, achieved: NDArray[Any], desired: NDArray[Any], away: Array) -> Outcome:
         """Return what is to be said of goals (..., 5); a tolerance of yaw weighs like one of distance in the dense reward."""
-        a, d = np.asarray(achieved, dtype=np.float64), np.asarray(desired, dtype=np.float64)
-        sine = a[..., 4] * d[..., 3] - a[..., 3] * d[..., 4]
-        cosine = a[..., 3] * d[..., 3] + a[..., 4] * d[..., 4]
-        away, turn = distance(a, d), np.degrees(np.abs(np.arctan2(sine, cosine)))
+        c, s = achieved[..., 3].astype(np.float64), achieved[..., 4].astype(np.float64)
+        to_c, to_s = desired[..., 3], desired[..., 4]
+        turn = np.degrees(np.abs(np.arctan2(s * to_c - c * to_s, c * to_c + s * to_s)))
         return Outcome(
             (away <= SUCCESS_CM) & (turn <= SUCCESS_DEG),
             -away - SUCCESS_CM / SUCCESS_DEG * turn,

@@ -26,7 +26,7 @@ from scipy.integrate import solve_bvp
 from tca_envs.mechanics import Arm, Equilibrium
 from tca_envs.mechanics.algebra import apply, apply_transposed, axpy, cross, dot, entry, inner, quaternion_rate, rotation_matrix
 from tca_envs.mechanics.arm import pose
-from tca_envs.mechanics.collocation import PAYLOAD_MASS
+from tca_envs.mechanics.kernels import PAYLOAD_MASS
 from tca_envs.mechanics.muscle import TENDON, elongation
 from tca_envs.study.method import Answer, Array, Method, State
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tca_envs.mechanics import Arm, Equilibrium, discretise, ladder
-from tca_envs.mechanics.collocation import FAILED, REPORT
+from tca_envs.mechanics.kernels import FAILED, REPORT
 from tca_envs.presets import STATES
 from tca_envs.study.method import Answer, Array, Method, State
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tca_envs.mechanics import Arm, Equilibrium, Module
-from tca_envs.mechanics.collocation import LOAD
+from tca_envs.mechanics.kernels import LOAD
 from tca_envs.mechanics.muscle import COIL, SPRING, TENDON
 from tca_envs.study.method import Answer, Array, Method, State
 

@@ -58,7 +58,7 @@ from tca_envs.mechanics.algebra import (
     scalar_matrix,
 )
 from tca_envs.mechanics.arm import gauss
-from tca_envs.mechanics.collocation import PAYLOAD_MASS
+from tca_envs.mechanics.kernels import PAYLOAD_MASS
 from tca_envs.mechanics.muscle import TENDON, elongation
 from tca_envs.study.method import Answer, Array, Method, State
 

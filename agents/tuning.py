@@ -1,0 +1,162 @@
+"""Search for better settings of a learner with Optuna: `python train.py --tune N`."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import optuna
+import yaml
+from stable_baselines3.common.callbacks import BaseCallback
+
+import train
+from agents.evaluate import evaluate
+
+SHARE = 0.25
+"""Of a whole training that a trial takes, unless told otherwise."""
+POINTS = 4
+"""A trial is evaluated so often; from the second point on it is given up if it is worse than the median of those before."""
+EPISODES = 50
+"""Of each point, on goals of the training split."""
+
+
+def tune(task: str, algorithm: str, settings: dict[str, Any], trials: int, options: argparse.Namespace, folder: Path) -> None:
+    """Try settings, print the best ones and leave them in `folder`; what is in there already is gone on with.
+
+    The settings with the largest mean return after a part of the training are the best: returns fall with the distance from
+    the goal at every step, so they count the way there, too.
+
+    Parameters
+    ----------
+    task, algorithm : str
+        What is trained.
+    settings : dict
+        `agents.hyperparameters.HYPERPARAMETERS` of them: what is not searched stays so.
+    trials : int
+        How many more.
+    options : argparse.Namespace
+        Of `train.py`: seed, device, and steps of a trial.
+    folder : pathlib.Path
+        Gets the study as `study.db`, for Optuna's own tools, and the best settings as `best.yml`, as in
+        `agents/hyperparameters`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    study = optuna.create_study(
+        storage=f"sqlite:///{folder / 'study.db'}",
+        study_name=f"{task}-{algorithm}",
+        load_if_exists=True,
+        direction="maximize",
+        sampler=optuna.samplers.TPESampler(seed=options.seed),
+        pruner=optuna.pruners.MedianPruner(n_startup_trials=3, n_warmup_steps=1),
+    )
+    steps = options.steps or int(SHARE * settings["n_timesteps"])
+
+    def worth(trial: optuna.Trial) -> float:
+        chosen = {**settings, **SPACES[algorithm](trial, settings)}
+        trial.set_user_attr("settings", chosen)
+        model = train.build(algorithm, chosen, options)
+        judge = Judge(trial, gymnasium.make_vec(settings["env"], EPISODES), steps)
+        model.learn(steps, callback=judge)
+        return judge.worth
+
+    def say(_: optuna.Study, trial: optuna.trial.FrozenTrial) -> None:
+        value = f"return {trial.value:.2f}" if trial.state == optuna.trial.TrialState.COMPLETE else trial.state.name.lower()
+        tried = ", ".join(f"{name} {short(given)}" for name, given in trial.params.items())
+        print(f"trial {trial.number}: {value}, {tried}")
+
+    study.optimize(worth, n_trials=trials, callbacks=[say])
+    best = dict(study.best_trial.user_attrs["settings"])
+    text = yaml.safe_dump({best.pop("env"): best}, sort_keys=False)
+    (folder / "best.yml").write_text(text)
+    print(
+        f"\nthe best, trial {study.best_trial.number} with return {study.best_value:.2f}, in {folder / 'best.yml'}:\n\n{text}"
+    )
+
+
+def short(value: Any) -> str:
+    """Return a setting as text."""
+    return f"{value:.2g}" if isinstance(value, float) else str(value)
+
+
+class Judge(BaseCallback):
+    """Evaluates a trial on its way, tells Optuna, and gives it up if that asks for it."""
+
+    def __init__(self, trial: optuna.Trial, env: Any, steps: int) -> None:
+        super().__init__()
+        self.trial, self.env, self.steps = trial, env, steps
+        self.points = 0
+        self.worth = float("nan")
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= (self.points + 1) * self.steps / POINTS and self.points + 1 < POINTS:
+            self.add_point()
+            if self.trial.should_prune():
+                raise optuna.TrialPruned
+        return True
+
+    def _on_training_end(self) -> None:
+        self.add_point()
+
+    def add_point(self) -> None:
+        """Evaluate."""
+        self.worth = evaluate(self.model, self.env, EPISODES, train.CURVE_SEED).episode_return
+        self.trial.report(self.worth, self.points)
+        self.points += 1
+
+
+def _any(trial: optuna.Trial) -> dict[str, Any]:
+    """Return what is searched for every learner."""
+    rate = trial.suggest_float("learning_rate", 1e-4, 5e-3, log=True)
+    return {"learning_rate": f"lin_{rate:.2g}"}
+
+
+def _net(trial: optuna.Trial, settings: dict[str, Any]) -> dict[str, Any]:
+    width = trial.suggest_categorical("width", [64, 128, 256])
+    return {**settings["policy_kwargs"], "net_arch": [width, width]}
+
+
+def ppo(trial: optuna.Trial, settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings of PPO to try."""
+    steps = trial.suggest_categorical("n_steps", [25, 50, 100, 200])
+    return {
+        **_any(trial),
+        "policy_kwargs": {**_net(trial, settings), "log_std_init": trial.suggest_float("log_std_init", -1.5, 0.5)},
+        "n_steps": steps,
+        "batch_size": settings["n_envs"] * steps // trial.suggest_categorical("batches", [5, 10, 20]),
+        "n_epochs": trial.suggest_int("n_epochs", 3, 15),
+        "gamma": trial.suggest_categorical("gamma", [0.8, 0.9, 0.95, 0.98, 0.99]),
+        "gae_lambda": trial.suggest_categorical("gae_lambda", [0.8, 0.9, 0.95]),
+    }
+
+
+def sac(trial: optuna.Trial, settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings of SAC to try."""
+    return {
+        **_any(trial),
+        "policy_kwargs": _net(trial, settings),
+        "batch_size": trial.suggest_categorical("batch_size", [128, 256, 512]),
+        "gradient_steps": trial.suggest_int("gradient_steps", 1, max(1, settings["n_envs"] // 2)),
+        "gamma": trial.suggest_categorical("gamma", [0.8, 0.9, 0.95, 0.98, 0.99]),
+        "tau": trial.suggest_float("tau", 0.002, 0.05, log=True),
+    }
+
+
+def dagger(trial: optuna.Trial, settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings of DAgger to try."""
+    width = trial.suggest_categorical("width", [64, 128, 256])
+    return {
+        **_any(trial),
+        "policy_kwargs": {**settings["policy_kwargs"], "net_arch": {"pi": [width, width], "vf": [1]}},
+        "batch_size": settings["n_envs"] * settings["n_steps"] // trial.suggest_categorical("batches", [10, 20, 40]),
+        "n_epochs": trial.suggest_int("n_epochs", 4, 20),
+    }
+
+
+SPACES: dict[str, Callable[[optuna.Trial, dict[str, Any]], dict[str, Any]]] = {
+    "ppo": ppo,
+    "sac": sac,
+    "her": sac,
+    "dagger": dagger,
+}
+"""What is searched for each algorithm."""
