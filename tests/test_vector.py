@@ -186,6 +186,16 @@ def plain(info):
     return {key: plain(info[key]) if isinstance(info[key], dict) else np.asarray(info[key]).item() for key in sorted(info)}
 
 
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="there is one thread only")
+@pytest.mark.parametrize("name", ["TCAReach-v0", "TCATwistAlign-v0", "TCAPickAndPlace-v0"])
+def test_the_number_of_threads_changes_nothing(name):
+    one, two = (native(name, 13, threads=threads) for threads in (1, 2))
+    assert_same(one.reset(seed=8), two.reset(seed=8))
+    for action in actions(one, 2 * EPISODE + 2):
+        assert_same(one.step(action), two.step(action))
+    assert_same(one.get_state(), two.get_state())
+
+
 def arrays(result):
     """Yield all arrays of numbers in it."""
     if isinstance(result, np.ndarray) and result.dtype != object:

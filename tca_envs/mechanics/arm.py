@@ -422,7 +422,7 @@ class Arm:
         -----
         Gauss collocation of the strain, by a ladder: Newton straight from the start, its first step the tangent's prediction;
         then substeps in drive and load; then those on a finer grid; then, where the branch ends, the fall down the hill of the
-        total energy, and on from there. See `collocation.newton`, `collocation.solve` and `ladder`.
+        total energy, and on from there. See `kernels.newton`, `kernels.follow` and `ladder`.
         """
         drive = self.checked_drive(drive)
         load = self.load(tip_force, tip_moment, payload)

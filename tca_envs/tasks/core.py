@@ -22,9 +22,10 @@ STEP_S = 0.1
 CUT_OFF = HARD_LIMIT - 2.0
 """Temperature [degC] that the heaters' firmware never lets a TCA exceed."""
 
-RAMP = (0.33, 0.67, 0.99, 1.0)
-"""Shares of the way in which `Core.settle` heats: with fewer, the solver more often doubts that it is on the branch that it
-began on; the last one is short, so that what is left of Newton's residual is little."""
+RAMP = (0.4, 0.7, 0.85, 0.99, 1.0)
+"""Shares of the way in which `Core.settle` heats. The hotter, the more the arm bends: longer steps there take the solver
+longer, and it doubts that it is on the branch that it began on. The last one is short, so that little is left of Newton's
+residual."""
 
 
 @dataclass

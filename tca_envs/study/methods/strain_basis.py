@@ -632,7 +632,7 @@ def _step(model, ws):
 
 @inner
 def _newton(model, q, tension, drive, load, damping, ws):
-    """Solve by Newton from (q, tension), in place; the rules are those of `collocation.newton`.
+    """Solve by Newton from (q, tension), in place; the rules are those of `kernels.newton`.
 
     Returns
     -------
