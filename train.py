@@ -68,7 +68,7 @@ def run_with_ray(options: argparse.Namespace) -> int:
     except ModuleNotFoundError as error:
         fail(f"--engine ray needs Ray: pip install -e '.[train,ray]' ({error})")
     here = os.cpu_count() or 1
-    needed = options.workers + 1 if options.seeds else options.workers
+    needed = options.workers + 1 if options.seeds or options.tune else options.workers
     with ExitStack() as stack:
         try:
             stack.enter_context(cluster(options.address, needed if options.address else max(needed, here)))

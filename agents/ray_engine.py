@@ -6,6 +6,7 @@ evaluating it needs no Ray.
 """
 
 import logging
+import os
 import shutil
 import socket
 import tempfile
@@ -326,6 +327,14 @@ def cluster(address: str | None, processors: int) -> Iterator[None]:
         ray.shutdown()
 
 
+class Progress(tune.Callback):
+    """Says of every trial that it is over."""
+
+    def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **_: Any) -> None:
+        """See `ray.tune.Callback`."""
+        print(f"the trial with {trial.config['setting']} is done")
+
+
 def run_trials(trial: Callable[[Any], dict[str, Any]], settings: Sequence[Any], workers: int) -> list[dict[str, Any]]:
     """Run a trial with each of some settings by Ray Tune, within `cluster`: as many at a time as that has processors for.
 
@@ -355,11 +364,12 @@ def run_trials(trial: Callable[[Any], dict[str, Any]], settings: Sequence[Any], 
     def go(config: dict[str, Any]) -> None:
         tune.report({"outcome": trial(config["setting"])})
 
+    os.environ.setdefault("RAY_AIR_NEW_OUTPUT", "0")  # whose head points to a folder that is gone in the end
     with tempfile.TemporaryDirectory() as scratch:
         results = tune.Tuner(
             tune.with_resources(go, places),
             param_space={"setting": tune.grid_search(list(settings))},
-            run_config=tune.RunConfig(storage_path=scratch, verbose=0),
+            run_config=tune.RunConfig(storage_path=scratch, verbose=0, callbacks=[Progress()]),
         ).fit()
     for result in results:
         if result.error is not None:

@@ -36,21 +36,24 @@ def tune(task: str, algorithm: str, settings: dict[str, Any], trials: int, optio
     trials : int
         How many more.
     options : argparse.Namespace
-        Of `train.py`: seed, device, and steps of a trial.
+        Of `train.py`: seed, device, and steps of a trial; with the engine ray trials run side by side.
     folder : pathlib.Path
         Gets the study as `study.db`, for Optuna's own tools, and the best settings as `best.yml`, as in
         `agents/hyperparameters`.
     """
+    folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    study = optuna.create_study(
-        storage=f"sqlite:///{folder / 'study.db'}",
-        study_name=f"{task}-{algorithm}",
-        load_if_exists=True,
-        direction="maximize",
-        sampler=optuna.samplers.TPESampler(seed=options.seed),
-        pruner=optuna.pruners.MedianPruner(n_startup_trials=3, n_warmup_steps=1),
-    )
     steps = options.steps or int(SHARE * settings["n_timesteps"])
+
+    def open_study(seed: int) -> optuna.Study:
+        return optuna.create_study(
+            storage=f"sqlite:///{folder / 'study.db'}",
+            study_name=f"{task}-{algorithm}",
+            load_if_exists=True,
+            direction="maximize",
+            sampler=optuna.samplers.TPESampler(seed=seed, constant_liar=options.engine == "ray"),
+            pruner=optuna.pruners.MedianPruner(n_startup_trials=3, n_warmup_steps=1),
+        )
 
     def worth(trial: optuna.Trial) -> float:
         chosen = {**settings, **SPACES[algorithm](trial, settings)}
@@ -65,7 +68,21 @@ def tune(task: str, algorithm: str, settings: dict[str, Any], trials: int, optio
         tried = ", ".join(f"{name} {short(given)}" for name, given in trial.params.items())
         print(f"trial {trial.number}: {value}, {tried}")
 
-    study.optimize(worth, n_trials=trials, callbacks=[say])
+    study = open_study(options.seed)
+    if options.engine == "ray":
+        from agents.ray_engine import run_trials
+
+        def one(number: int) -> dict[str, Any]:
+            """Run a trial in a process of its own; they meet in the file of the study."""
+            open_study(options.seed + number).optimize(worth, n_trials=1)
+            return {}
+
+        begun = len(study.trials)
+        run_trials(one, range(begun, begun + trials), options.workers)
+        for trial in study.trials[begun:]:
+            say(study, trial)
+    else:
+        study.optimize(worth, n_trials=trials, callbacks=[say])
     best = dict(study.best_trial.user_attrs["settings"])
     text = yaml.safe_dump({best.pop("env"): best}, sort_keys=False)
     (folder / "best.yml").write_text(text)

@@ -274,3 +274,18 @@ def test_a_cluster_that_is_too_small_or_not_there_is_told(arguments, message, ad
     assert message in capsys.readouterr().err
     assert policy.read_text() == "of an earlier run"
     assert not ray.is_initialized()
+
+
+@pytest.mark.slow
+def test_settings_are_searched_side_by_side(address, tmp_path):
+    optuna = pytest.importorskip("optuna", reason="needs the extra tune")
+    options = "--steps", 100, "--out", tmp_path, "--address", address
+    status, out, errors = finish(run("--engine", "ray", "--tune", 2, *options))
+    assert status == 0, errors
+    study = optuna.load_study(study_name="reach-ppo", storage=f"sqlite:///{tmp_path / 'study.db'}")
+    first, second = study.trials
+    assert first.state == second.state == optuna.trial.TrialState.COMPLETE
+    assert first.params != second.params
+    for trial in study.trials:
+        assert f"trial {trial.number}: return {trial.value:.2f}" in out
+    assert (tmp_path / "best.yml").exists()

@@ -41,7 +41,7 @@ def test_what_is_tried_is_complete_settings_that_learners_take(algorithm):
     for _ in range(3):
         tried = tuning.SPACES[algorithm](study.ask(), settings)
         assert set(tried) <= {*settings, "tau"}
-        train.build(algorithm, {**settings, **tried}, argparse.Namespace(seed=0, device="cpu"))
+        train.build(algorithm, {**settings, **tried}, argparse.Namespace(engine="sb3", seed=0, device="cpu"))
 
 
 def test_every_algorithm_has_a_space():
