@@ -104,6 +104,8 @@ def test_a_worker_steps_what_the_single_environment_steps(address):
         lanes = runner.num_envs
         first, second = (runner.sample(num_timesteps=60 * lanes) for _ in range(2))
         metrics = runner.get_metrics()
+        third = runner.sample(num_timesteps=100 * lanes)
+        later = runner.get_metrics()
     assert len(first) == lanes and len(second) == 2 * lanes
     lane = 5
     env = gym.make(ID)
@@ -126,6 +128,9 @@ def test_a_worker_steps_what_the_single_environment_steps(address):
     returns = [sum(e.get_return() for e in (first[i], second[2 * i])) for i in range(lanes)]
     np.testing.assert_allclose(returns[lane], ended, rtol=1e-6)
     np.testing.assert_allclose(metrics["episode_return_mean"].peek(), np.mean(returns), rtol=1e-5)
+    returns = [second[2 * i + 1].get_return() + third[2 * i].get_return() for i in range(lanes)]
+    np.testing.assert_allclose(later["episode_return_mean"].peek(), np.mean(returns), rtol=1e-5)
+    assert later["episode_len_mean"].peek() == 100
 
 
 class Stop(BaseCallback):
