@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import root_scalar
 
 from tca_envs.mechanics import check
 from tca_envs.mechanics.algebra import entry
@@ -132,6 +131,8 @@ class Gripper:
         ValueError
             For a width outside (0, L/4] or temperatures that the TCA's law does not accept.
         """
+        from scipy.optimize import root_scalar  # takes as long to import as all else
+
         width = check.scalar("width", width, 0.0, 0.25 * self.length, above=True)
         given = self._checked(temperature)
         result = np.zeros(given.size)

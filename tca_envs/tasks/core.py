@@ -141,10 +141,11 @@ class Core:
             record.tip, record.length, report, self.threads, heat,
         )  # fmt: skip
         good = solved(report)
-        record.temperature[good] = temperature[good]
+        rows = slice(None) if good.all() else good
+        record.temperature[rows] = temperature[rows]
         if heat is not None:
-            record.power[good] = heat.power[good]
-            record.energy[good] += heat.power[good].sum(axis=1) * STEP_S
+            record.power[rows] = heat.power[rows]
+            record.energy[rows] += STEP_S * np.add.reduce(heat.power[rows], axis=1)
         return report
 
     def reset(self, lanes: NDArray[np.intp], goals: Array | float, scenes: Array | float) -> None:
