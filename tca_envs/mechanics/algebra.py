@@ -1,7 +1,7 @@
 """Vectors and 3 x 3 matrices as tuples, for compiled kernels: they live in registers and allocate nothing.
 
-Numba's cache watches the file of a kernel, not those of the kernels that it calls: after a change here or in `muscle`, delete
-the package's `__pycache__` folders.
+Numba's cache watches the file of a kernel, not those of the functions that it calls: after a change here, in `traced` or in
+`muscle`, delete the package's `__pycache__` folders.
 
 A matrix is its nine numbers, row by row. A quaternion is (w, x, y, z).
 """
@@ -9,6 +9,8 @@ A matrix is its nine numbers, row by row. A quaternion is (w, x, y, z).
 from typing import Any
 
 from numba import njit
+
+from tca_envs.mechanics.traced import traced
 
 # Not nnan or ninf: overflow must stay visible.
 OPTIONS: dict[str, Any] = {
@@ -75,31 +77,31 @@ def put9(array, i, x):
     ) = x  # fmt: skip
 
 
-@_small
+@traced
 def dot(a, b):
     """Return a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@_small
+@traced
 def axpy(c, a, b):
     """Return c a + b for vectors."""
     return c * a[0] + b[0], c * a[1] + b[1], c * a[2] + b[2]
 
 
-@_small
+@traced
 def cross(a, b):
     """Return a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@_small
+@traced
 def cross_matrix(a):
     """Return [a] with [a] b = a x b."""
     return 0.0, -a[2], a[1], a[2], 0.0, -a[0], -a[1], a[0], 0.0
 
 
-@_small
+@traced
 def outer(a, b):
     """Return a b^T."""
     return (
@@ -109,13 +111,13 @@ def outer(a, b):
     )  # fmt: skip
 
 
-@_small
+@traced
 def scalar_matrix(c):
     """Return c times the unit matrix."""
     return c, 0.0, 0.0, 0.0, c, 0.0, 0.0, 0.0, c
 
 
-@_small
+@traced
 def axpy9(c, a, b):
     """Return c a + b for matrices."""
     return (
@@ -125,7 +127,7 @@ def axpy9(c, a, b):
     )  # fmt: skip
 
 
-@_small
+@traced
 def apply(a, x):
     """Return a x."""
     return (
@@ -135,7 +137,7 @@ def apply(a, x):
     )
 
 
-@_small
+@traced
 def apply_transposed(a, x):
     """Return a^T x."""
     return (
@@ -145,13 +147,13 @@ def apply_transposed(a, x):
     )
 
 
-@_small
+@traced
 def transpose(a):
     """Return a^T."""
     return a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8]
 
 
-@_small
+@traced
 def matmul(a, b):
     """Return a b."""
     return (
@@ -167,7 +169,7 @@ def matmul(a, b):
     )
 
 
-@_small
+@traced
 def inverse(a):
     """Return the inverse of a, by cofactors."""
     c0 = a[4] * a[8] - a[5] * a[7]
@@ -181,7 +183,7 @@ def inverse(a):
     )  # fmt: skip
 
 
-@_small
+@traced
 def quaternion_rate(q, x):
     """Return q o [0, x]."""
     return (
@@ -192,7 +194,7 @@ def quaternion_rate(q, x):
     )
 
 
-@_small
+@traced
 def quaternion_turn(x, q):
     """Return [1, x] o q: q turned by about 2 x in the global frame."""
     return (
@@ -203,7 +205,7 @@ def quaternion_turn(x, q):
     )
 
 
-@_small
+@traced
 def rotation_matrix(q):
     """Return the rotation matrix of a quaternion of any norm."""
     s = 2.0 / (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])

@@ -484,15 +484,15 @@ class Arm:
 
     def _closed_form(self, lane: Lane, drive: Array, load: Array, tip: Array, lengths: Array, report: Array) -> bool:
         """Solve in closed form, in place; False where that is no answer, or where the lane is left as it was."""
-        found = tuple(values[np.newaxis].copy() for values in lane)
-        if not closed_form.solve_lane(self.model, self.sections, *found, drive, load, tip, lengths, report):
+        strain, tension, at_drive, at_load = (values.copy() for values in lane)
+        known = (strain[np.newaxis], tension[np.newaxis], at_drive[np.newaxis], at_load[np.newaxis])
+        if not closed_form.solve_lane(self.model, self.sections, *known, drive, load, tip, lengths, report):
             return False
         # Where nothing pushes the energy is convex; but a muscle may, and a coarse grid may not hold the shape.
-        strain, tension, at_drive, at_load = (values[0] for values in found)
         if ladder.negative_eigenvalues(self.model, strain, tension, at_drive, at_load, kernels.NEUTRAL):
             return False
-        for values, new in zip(lane, found, strict=True):
-            values[...] = new[0]
+        for values, new in zip(lane, (strain, tension, at_drive, at_load), strict=True):
+            values[...] = new
         return True
 
     def shape(self, lane: Lane) -> tuple[Array, ...]:
@@ -654,14 +654,10 @@ def _sections(modules: tuple[Module, ...], grids: tuple[Grid, ...], node_arc: Ar
         if len(turns) > 1 or (any(turns) and not alike):
             return None
         turn[k] = 2.0 * np.pi * sum(turns) / module.length
-    routes = [module.route(muscle, 0.0) for module in modules for muscle in module.muscles]
-    lever, slope = np.zeros((len(routes), 3, 6)), np.zeros((len(routes), 3))
-    for i, (x, y, dx, dy) in enumerate(routes):
-        lever[i] = np.hstack([-section.cross_matrix(np.array([x, y, 0.0])), np.eye(3)])
-        slope[i, :2] = dx, dy
+    route = np.array([module.route(muscle, 0.0) for module in modules for muscle in module.muscles]).reshape(-1, 4)
     bases = np.cumsum([0.0, *(module.length for module in modules[:-1])])
     arc = node_arc - np.repeat(bases, [grid.elements * grid.nodes for grid in grids])
-    return closed_form.Sections(lever, slope, turn, arc)
+    return closed_form.Sections(route, turn, arc)
 
 
 def _compile(modules: tuple[Module, ...], grids: tuple[Grid, ...], tolerance: float) -> tuple[Model, Array]:

@@ -11,9 +11,40 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs.mechanics.algebra import entry, inner
-from tca_envs.mechanics.kernels import CLOSED_FORM
-from tca_envs.mechanics.muscle import TENDON, elongation
+from tca_envs.mechanics.algebra import (
+    ORIGIN,
+    apply,
+    axpy,
+    axpy9,
+    cross_matrix,
+    entry,
+    matmul,
+    scalar_matrix,
+    transpose,
+)
+from tca_envs.mechanics.kernels import (
+    CLOSED_FORM,
+    FIRST_MUSCLE,
+    KIND,
+    LAW,
+    LENGTH,
+    MODULES,
+    NODES_OF,
+    PIECES,
+    REFERENCE,
+    REST,
+    STIFFNESS,
+    about,
+    along,
+    get3,
+    get9,
+    put3,
+    put9,
+    stiffened,
+)
+from tca_envs.mechanics.muscle import PARAMETERS, TENDON, law
+from tca_envs.mechanics.packs import pointer_to_floats, pointer_to_ints
+from tca_envs.mechanics.traced import choose, cosine, root, sine, size, traced
 
 Array = NDArray[np.float64]
 
@@ -21,160 +52,167 @@ MAX_ITERATIONS = 30
 MAX_STEP = 0.5
 """Of the rotation over a module [rad] and of the rest of the strain."""
 ROUND_OFF = 1e-12
+STRAIN, POSITION, ROTATION, RHS = 0, 6, 9, 18
+"""Places of the numbers that are worked on: a module's strain, the pose at its base, Newton's right-hand side and, behind
+it, his matrix."""
 
 
 class Sections(NamedTuple):
     """The sections at the modules' bases, besides what `collocation.Model` holds. M modules, n muscles, G nodes."""
 
-    lever: Array  # (n, 3, 6) J = [-r^, 1]: the muscle's path is J xi + r'
-    slope: Array  # (n, 3) r'
+    route: Array  # (n, 4) muscle position x, y [m] and its derivative in s
     turn: Array  # (M,) of the muscles about the centerline [rad/m]
     arc: Array  # (G,) distance of each node from its module's base [m]
 
 
-@inner
-def _equations(model, sections, k, strain, tension, drive, matrix, rhs, lengths):
-    """Fill Newton's equations of module k, matrix (6 + m, 6 + m) and rhs; return the dimensionless residual."""
-    first, muscles, span = model.first_muscle[k], model.first_muscle[k + 1] - model.first_muscle[k], model.length[k]
-    worst = 0.0
-    matrix[:] = 0.0
-    for a in range(6):
-        matrix[a, a] = model.stiffness[k, a]
-        rhs[a] = model.stiffness[k, a] * (model.reference[k, a] - strain[a])
-    path, wrench = np.empty(3), np.empty(6)
-    across, turned = np.empty((3, 3)), np.empty((3, 6))
-    for c in range(muscles):
-        i = first + c
-        lever = sections.lever[i]
-        for x in range(3):
-            path[x] = sections.slope[i, x]
-            for a in range(6):
-                path[x] += lever[x, a] * strain[a]
-        norm = np.sqrt(path[0] ** 2 + path[1] ** 2 + path[2] ** 2)
-        if not norm > 1e-9:
-            return np.inf
-        for x in range(3):
-            for y in range(3):
-                across[x, y] = ((1.0 if x == y else 0.0) - path[x] * path[y] / norm**2) / norm
-        for a in range(6):
-            wrench[a] = (lever[0, a] * path[0] + lever[1, a] * path[1] + lever[2, a] * path[2]) / norm
-            for x in range(3):
-                turned[x, a] = across[x, 0] * lever[0, a] + across[x, 1] * lever[1, a] + across[x, 2] * lever[2, a]
-        for a in range(6):
-            for b in range(6):
-                product = lever[0, a] * turned[0, b] + lever[1, a] * turned[1, b] + lever[2, a] * turned[2, b]
-                matrix[a, b] += tension[i] * product
-            matrix[a, 6 + c] = wrench[a]
-            rhs[a] -= tension[i] * wrench[a]
-        lengths[i] = span * norm
-        if model.kind[i] == TENDON:
-            matrix[6 + c, 6 + c] = -1.0
-            rhs[6 + c] = tension[i] - drive[i]
-            continue
-        rest = model.rest_length[i]
-        delta, softness, _ = elongation(model.kind[i], model.parameters, i, rest, tension[i], drive[i])
-        for a in range(6):
-            matrix[6 + c, a] = span * wrench[a]
-        matrix[6 + c, 6 + c] = -softness
-        rhs[6 + c] = rest + delta - lengths[i]
-        worst = max(worst, abs(rhs[6 + c]) / rest)
-    for a in range(6):
-        worst = max(worst, abs(rhs[a]) / model.stiffness[k, a] * (span if a < 3 else 1.0))
-    return worst
+@traced
+def _turned(angle, x):
+    """Return a vector turned about z."""
+    c, s = cosine(angle), sine(angle)
+    return c * x[0] - s * x[1], s * x[0] + c * x[1], x[2]
 
 
-@inner
-def _eliminate(matrix, rhs):
-    """Solve in place without pivoting: the strain's block is definite, the muscles' complement negative definite."""
-    size = rhs.size
-    for k in range(size):
-        for i in range(k + 1, size):
-            factor = matrix[i, k] / matrix[k, k]
-            for j in range(k + 1, size):
-                matrix[i, j] -= factor * matrix[k, j]
-            rhs[i] -= factor * rhs[k]
-    for k in range(size - 1, -1, -1):
-        for j in range(k + 1, size):
-            rhs[k] -= matrix[k, j] * rhs[j]
-        rhs[k] /= matrix[k, k]
-
-
-@inner
-def _module(model, sections, k, strain, tension, drive, lengths):
-    """Solve module k from (strain (6,), tension), in place; returns the residual and Newton's iterations."""
-    first, muscles = model.first_muscle[k], model.first_muscle[k + 1] - model.first_muscle[k]
-    matrix, rhs = np.empty((6 + muscles, 6 + muscles)), np.empty(6 + muscles)
-    for c in range(muscles):
-        if model.kind[first + c] == TENDON:
-            tension[first + c] = drive[first + c]
-    before = np.inf
-    for iteration in range(MAX_ITERATIONS):
-        worst = _equations(model, sections, k, strain, tension, drive, matrix, rhs, lengths)
-        # Down to round-off: the last steps cost next to nothing.
-        if worst < ROUND_OFF or (worst < 1e3 * ROUND_OFF and worst >= before) or not worst < np.inf:
-            return worst, iteration
-        before = worst
-        _eliminate(matrix, rhs)
-        most = 0.0
-        for a in range(6):
-            most = max(most, abs(rhs[a]) * (model.length[k] if a < 3 else 1.0))
-        step = min(1.0, MAX_STEP / max(most, 1e-300))
-        for a in range(6):
-            strain[a] += step * rhs[a]
-        for c in range(muscles):
-            tension[first + c] += step * rhs[6 + c]
-    return np.inf, MAX_ITERATIONS
-
-
-@inner
-def _turn_about_z(angle, strain, turned):
-    """Turn both halves of a strain (6,) about z, into `turned`."""
-    c, s = np.cos(angle), np.sin(angle)
-    for part in range(0, 6, 3):
-        x, y = strain[part], strain[part + 1]
-        turned[part], turned[part + 1], turned[part + 2] = c * x - s * y, s * x + c * y, strain[part + 2]
-
-
-@inner
-def _move(rotation, position, strain, turn, length):
-    """Take a pose along a module of constant strain in its turning frame: exp(L (xi^ + turn e_z)) Rz(-turn L)."""
-    w = (length * strain[0], length * strain[1], length * (strain[2] + turn))
+@traced
+def _moved(rotation, position, u, v, turn, length):
+    """Return a pose taken along a module of constant strain in its turning frame: exp(L (xi^ + turn e_z)) Rz(-turn L)."""
+    w = (length * u[0], length * u[1], length * (u[2] + turn))
     square = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-    angle = np.sqrt(square)
-    if angle > 1e-2:
-        first, second = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
-        third = (1.0 - first) / square
-    else:  # series, to round-off
-        first = 1.0 - square / 6.0 + square * square / 120.0
-        second = 0.5 - square / 24.0 + square * square / 720.0
-        third = 1.0 / 6.0 - square / 120.0 + square * square / 5040.0
-    hat = np.zeros((3, 3))
-    hat[0, 1], hat[0, 2], hat[1, 2] = -w[2], w[1], -w[0]
-    hat[1, 0], hat[2, 0], hat[2, 1] = w[2], -w[1], w[0]
-    turned, moved, back = np.eye(3), np.eye(3), np.eye(3)
-    for a in range(3):
-        for b in range(3):
-            twice = hat[a, 0] * hat[0, b] + hat[a, 1] * hat[1, b] + hat[a, 2] * hat[2, b]
-            turned[a, b] += first * hat[a, b] + second * twice
-            moved[a, b] += second * hat[a, b] + third * twice
-    c, s = np.cos(turn * length), np.sin(turn * length)
-    back[0, 0], back[0, 1], back[1, 0], back[1, 1] = c, s, -s, c
-    along = np.zeros(3)
-    for a in range(3):
-        for b in range(3):
-            along[a] += length * moved[a, b] * strain[3 + b]
-    old = rotation.copy()
-    for a in range(3):
-        position[a] += old[a, 0] * along[0] + old[a, 1] * along[1] + old[a, 2] * along[2]
-        for b in range(3):
-            rotation[a, b] = 0.0
-            for c in range(3):
-                for d in range(3):
-                    rotation[a, b] += old[a, c] * turned[c, d] * back[d, b]
+    angle, far = root(square), choose(1e-4, square, square, 1.0)
+    # Near zero their series, to round-off.
+    first = choose(1e-4, square, sine(angle) / root(far), 1.0 - square / 6.0 + square * square / 120.0)
+    second = choose(1e-4, square, (1.0 - cosine(angle)) / far, 0.5 - square / 24.0 + square * square / 720.0)
+    third = choose(1e-4, square, (1.0 - first) / far, 1.0 / 6.0 - square / 120.0 + square * square / 5040.0)
+    hat = cross_matrix(w)
+    twice, one = matmul(hat, hat), scalar_matrix(1.0)
+    turned, swept = axpy9(first, hat, axpy9(second, twice, one)), axpy9(second, hat, axpy9(third, twice, one))
+    c, s = cosine(turn * length), sine(turn * length)
+    back = (c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0)
+    return matmul(matmul(rotation, turned), back), axpy(length, apply(rotation, apply(swept, v)), position)
+
+
+@traced
+def _diagonal(f, at):
+    """Return the diagonal matrix of three numbers."""
+    return f[at], 0.0, 0.0, 0.0, f[at + 1], 0.0, 0.0, 0.0, f[at + 2]
+
+
+@traced
+def _put_blocks(w, matrix, order, uu, vu, vv):
+    """Write the strain's block of Newton's matrix."""
+    uv = transpose(vu)
+    for row in range(3):
+        put3(w, matrix + row * order, uu[3 * row : 3 * row + 3])
+        put3(w, matrix + row * order + 3, uv[3 * row : 3 * row + 3])
+        put3(w, matrix + (row + 3) * order, vu[3 * row : 3 * row + 3])
+        put3(w, matrix + (row + 3) * order + 3, vv[3 * row : 3 * row + 3])
+
+
+@traced
+def _put_column(w, at, order, moment, force):
+    """Write a muscle's column of Newton's matrix."""
+    for row in range(3):
+        w[at + row * order] = moment[row]
+        w[at + (row + 3) * order] = force[row]
 
 
 @entry
-def solve_lane(model, sections, strain, tension, from_drive, from_load, drive, load, tip, lengths, report):
+def _solve(model_f, model_i, route, turn, arc, drive, tension, strain, path, work):
+    """Fill strain, tension, path and, in `work`, the pose of the tip; return residual (inf: no answer) and iterations."""
+    f, i, w = pointer_to_floats(model_f), pointer_to_ints(model_i), pointer_to_floats(work)
+    routes, turns, arcs = pointer_to_floats(route), pointer_to_floats(turn), pointer_to_floats(arc)
+    drives, pulls = pointer_to_floats(drive), pointer_to_floats(tension)
+    strains, paths = pointer_to_floats(strain), pointer_to_floats(path)
+    largest, most, g = 0.0, 0, 0
+    put9(w, ROTATION, scalar_matrix(1.0))
+    put3(w, POSITION, ORIGIN)
+    for k in range(i[MODULES]):
+        i0 = i[i[FIRST_MUSCLE] + k]
+        order = 6 + i[i[FIRST_MUSCLE] + k + 1] - i0
+        matrix, stiffness, reference = RHS + order, i[STIFFNESS] + 6 * k, i[REFERENCE] + 6 * k
+        span, rate = f[i[LENGTH] + k], turns[k]
+        angle = -rate * arcs[g]
+        put3(w, STRAIN, _turned(angle, get3(strains, 6 * g)))
+        put3(w, STRAIN + 3, _turned(angle, get3(strains, 6 * g + 3)))
+        before = np.inf
+        for iteration in range(MAX_ITERATIONS):
+            # Newton's equations.
+            u, v = get3(w, STRAIN), get3(w, STRAIN + 3)
+            uu, vu, vv = _diagonal(f, stiffness), scalar_matrix(0.0), _diagonal(f, stiffness + 3)
+            for at in range(6 * order, order * order):
+                w[matrix + at] = 0.0
+            for d in range(6):
+                w[RHS + d] = f[stiffness + d] * (f[reference + d] - w[STRAIN + d])
+            for c in range(6, order):
+                muscle = i0 + c - 6
+                at = 4 * muscle
+                x, y = routes[at], routes[at + 1]
+                t, norm = along(x, y, routes[at + 2], routes[at + 3], u, v)
+                if not norm > 1e-9:
+                    return np.inf, iteration
+                paths[muscle] = span * norm
+                moment, row = about(x, y, t), matrix + c * order
+                _put_column(w, matrix + c, order, moment, t)
+                if i[i[KIND] + muscle] == TENDON:
+                    pulls[muscle] = drives[muscle]
+                    w[row + c], w[RHS + c] = -1.0, 0.0
+                else:
+                    rest = f[i[REST] + muscle]
+                    parameters = i[LAW] + PARAMETERS * muscle
+                    delta, soft, _ = law(i[i[KIND] + muscle], f, parameters, rest, pulls[muscle], drives[muscle])
+                    put3(w, row, axpy(span, moment, ORIGIN))
+                    put3(w, row + 3, axpy(span, t, ORIGIN))
+                    w[row + c], w[RHS + c] = -soft, rest + delta - span * norm
+                pull = pulls[muscle]
+                uu, vu, vv = stiffened(x, y, t, pull / norm, uu, vu, vv)
+                put3(w, RHS, axpy(-pull, moment, get3(w, RHS)))
+                put3(w, RHS + 3, axpy(-pull, t, get3(w, RHS + 3)))
+            _put_blocks(w, matrix, order, uu, vu, vv)
+            worst = 0.0
+            for d in range(order):
+                scale = (span if d < 3 else 1.0) / f[stiffness + d] if d < 6 else 1.0 / f[i[REST] + i0 + d - 6]
+                share = size(w[RHS + d]) * scale
+                if not share < np.inf:
+                    return np.inf, iteration
+                worst = choose(worst, share, share, worst)
+            # Down to round-off: the last steps cost next to nothing.
+            if worst < ROUND_OFF or (worst < 1e3 * ROUND_OFF and worst >= before):
+                break
+            before = worst
+            # Without pivoting: the strain's block is definite, the muscles' complement negative definite.
+            for c in range(order):
+                for row in range(c + 1, order):
+                    factor = w[matrix + row * order + c] / w[matrix + c * order + c]
+                    for d in range(c + 1, order):
+                        w[matrix + row * order + d] -= factor * w[matrix + c * order + d]
+                    w[RHS + row] -= factor * w[RHS + c]
+            for c in range(order - 1, -1, -1):
+                for d in range(c + 1, order):
+                    w[RHS + c] -= w[matrix + c * order + d] * w[RHS + d]
+                w[RHS + c] /= w[matrix + c * order + c]
+            longest = MAX_STEP
+            for d in range(6):
+                length = size(w[RHS + d]) * (span if d < 3 else 1.0)
+                longest = choose(longest, length, length, longest)
+            step = MAX_STEP / longest
+            for d in range(6):
+                w[STRAIN + d] += step * w[RHS + d]
+            for c in range(6, order):
+                pulls[i0 + c - 6] += step * w[RHS + c]
+        else:
+            return np.inf, MAX_ITERATIONS
+        largest, most = choose(largest, worst, worst, largest), max(most, iteration)
+        u, v = get3(w, STRAIN), get3(w, STRAIN + 3)
+        for _ in range(i[i[PIECES] + k] * i[i[NODES_OF] + k]):
+            put3(strains, 6 * g, _turned(rate * arcs[g], u))
+            put3(strains, 6 * g + 3, _turned(rate * arcs[g], v))
+            g += 1
+        rotation, position = _moved(get9(w, ROTATION), get3(w, POSITION), u, v, rate, span)
+        put9(w, ROTATION, rotation)
+        put3(w, POSITION, position)
+    return largest, most
+
+
+def solve_lane(model, sections, strain, tension, from_drive, from_load, drive, load, tip, lengths, report) -> bool:
     """Find the equilibrium of one arm that nothing loads; arguments as of `collocation.solve_lanes` with N = 1.
 
     Returns
@@ -182,23 +220,13 @@ def solve_lane(model, sections, strain, tension, from_drive, from_load, drive, l
     bool
         Whether there is an answer; otherwise nothing is changed.
     """
-    rotation, position, here = np.eye(3), np.zeros(3), np.empty(6)
-    found, pull, path = np.empty_like(strain[0]), tension[0].copy(), np.empty_like(lengths[0])
-    worst, iterations, g0 = 0.0, 0, 0
-    for k in range(model.length.size):
-        turn = sections.turn[k]
-        _turn_about_z(-turn * sections.arc[g0], strain[0, g0], here)
-        residual, steps = _module(model, sections, k, here, pull, drive[0], path)
-        if not residual < np.inf:
-            return False
-        worst, iterations = max(worst, residual), max(iterations, steps)
-        for _ in range(model.elements[k] * model.nodes[k]):
-            _turn_about_z(turn * sections.arc[g0], here, found[g0])
-            g0 += 1
-        _move(rotation, position, here, turn, model.length[k])
+    found, pull, path = strain[0].copy(), tension[0].copy(), np.empty_like(lengths[0])
+    order = 6 + model.route.shape[1]
+    work = np.empty(RHS + order + order * order)
+    residual, iterations = _solve(model.f, model.i, *sections, drive[0], pull, found, path, work)
+    if not residual < np.inf:
+        return False
     strain[0], tension[0], lengths[0], from_drive[0], from_load[0] = found, pull, path, drive[0], load[0]
-    tip[0, :3, :3] = rotation
-    tip[0, :3, 3] = position
-    report[0, 0], report[0, 1], report[0, 2] = CLOSED_FORM, worst, iterations
-    report[0, 3] = report[0, 4] = 0.0
+    tip[0, :3, :3], tip[0, :3, 3] = work[ROTATION:RHS].reshape(3, 3), work[POSITION:ROTATION]
+    report[0] = CLOSED_FORM, residual, iterations, 0.0, 0.0
     return True

@@ -1,5 +1,6 @@
 """The equilibrium of arms by Gauss collocation of the strain: what Python calls of the compiled `kernels`."""
 
+import gc
 import threading
 from functools import cache
 from typing import NamedTuple
@@ -9,35 +10,79 @@ from numba import cfunc, get_num_threads, get_thread_id, prange, set_num_threads
 from numpy.typing import NDArray
 
 from tca_envs.mechanics import kernels
-from tca_envs.mechanics.algebra import CALLED, apply, dot, entry, inner, parallel, rotation_matrix
+from tca_envs.mechanics.algebra import CALLED, apply, axpy, dot, entry, merged, parallel, rotation_matrix
 from tca_envs.mechanics.kernels import (
+    ACTIVE,
     AT_ACTION,
+    AT_DRIVE,
+    AT_FROM_DRIVE,
+    AT_FROM_LOAD,
     AT_HEATING,
+    AT_LENGTHS,
+    AT_LOAD,
     AT_POWER,
+    AT_REPORT,
     AT_STRAIN,
     AT_TEMPERATURE,
+    AT_TENSION,
+    AT_TIP,
+    BEND,
     BUDGET,
     COUNT,
+    DRIVE,
+    ELEMENTS,
+    ELIMINATE,
+    ENDS,
+    EVALUATE,
+    FORCE,
+    GAP,
     HEAT,
     HEATED,
+    INDEX,
     JOB,
+    KIND,
     LANES,
+    LAW,
+    LENGTH,
     LOAD,
     MAX_ITERATIONS,
+    MODULES,
+    MUSCLES,
+    NODES,
+    NODES_OF,
+    PATHS,
     PAYLOAD_MASS,
+    PIECES,
+    REFERENCE,
     REPORT,
+    RESIDUAL,
+    REST,
+    ROTATED,
+    SHEAR,
+    SHEARED,
+    STIFFNESS,
+    STRAIN,
+    SUBSTITUTE,
+    TENSION,
+    TIP,
+    TOTAL,
+    WIDE,
+    WORST,
+    B,
+    get3,
 )  # fmt: skip
-from tca_envs.mechanics.muscle import PARAMETERS, TENDON, elongation, pull, stored
+from tca_envs.mechanics.muscle import PARAMETERS, TENDON, law, pull, stored
 from tca_envs.mechanics.packs import (
     ALIGNMENT,
     KERNEL,
-    PACK,
     address_of,
     call_kernel,
+    floats_of,
     pointer_to_floats,
     pointer_to_ints,
     pointer_to_packs,
 )  # fmt: skip
+from tca_envs.mechanics.traced import PACK, spread, traced
 
 Array = NDArray[np.float64]
 
@@ -153,10 +198,10 @@ def solve_lanes(
     if threads > 1 and len(strain) > PACK:
         before = get_num_threads()
         set_num_threads(threads)
-        _solve_in_parallel(model.f, model.i, addresses(), _scratch.of(model, threads), steps, first, *arrays)
+        _solve_in_parallel(model.f, model.i, addresses().copy(), _scratch.of(model, threads), steps, first, *arrays)
         set_num_threads(before)
     else:
-        _solve_serially(model.f, model.i, addresses(), _scratch.of(model), steps, first, *arrays)
+        _solve_serially(model.f, model.i, addresses().copy(), _scratch.of(model)[0], steps, first, *arrays)
 
 
 def budget(model):
@@ -166,18 +211,30 @@ def budget(model):
 
 @cache
 def addresses() -> NDArray[np.int64]:
-    """Return the addresses of the kernels; compiles them, or loads them from the cache: no part of the time of a solve."""
+    """Return what kernels find in `a`, but for what is a lane's; compiles them, or loads them from the cache."""
     made = (
         kernels.evaluate, kernels.eliminate, kernels.substitute, kernels.newton, kernels.follow, kernels.heat, kernels.lanes,
     )  # fmt: skip
     compiled = [cfunc(KERNEL, **CALLED)(kernel) for kernel in made]
     _KEPT.extend(compiled)
-    return np.array([kernel.address for kernel in compiled], dtype=np.int64)
+    job = np.zeros(JOB, dtype=np.int64)
+    job[: len(compiled)] = np.array([kernel.address for kernel in compiled])
+    return job
 
 
 @cache
 def compile_kernels():
     """Compile everything or load it from the cache, so that this is no part of the time of a solve."""
+    collects = gc.isenabled()
+    gc.disable()  # it would take a tenth of the time
+    try:
+        _compile_kernels()
+    finally:
+        if collects:
+            gc.enable()
+
+
+def _compile_kernels():
     one, none = np.ones(1, dtype=np.int64), np.zeros(0, dtype=np.int64)
     straight, load = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]), np.zeros((1, LOAD))
     fields = (
@@ -195,57 +252,54 @@ _KEPT: list = []
 """Compiled kernels: their code lives as long as they do."""
 
 
-@entry
-def _job(
-    addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action, temperature, power,
+@merged
+def _fill(
+    job, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action, temperature, power,
     constants,
 ):  # fmt: skip
-    """Return what kernels find in `a`."""
-    job = np.empty(JOB, dtype=np.int64)
-    for k in range(AT_STRAIN):
-        job[k] = addresses[k]
-    job[AT_STRAIN], job[AT_STRAIN + 1] = address_of(strain), address_of(tension)
-    job[AT_STRAIN + 2], job[AT_STRAIN + 3] = address_of(from_drive), address_of(from_load)
-    job[AT_STRAIN + 4], job[AT_STRAIN + 5] = address_of(drive), address_of(load)
-    job[AT_STRAIN + 6], job[AT_STRAIN + 7], job[AT_STRAIN + 8] = address_of(tip), address_of(lengths), address_of(report)
-    job[AT_ACTION], job[AT_TEMPERATURE] = address_of(action) if len(action) else 0, address_of(temperature)
-    job[AT_POWER], job[AT_HEATING] = address_of(power), address_of(constants)
-    job[COUNT], job[BUDGET], job[HEATED] = len(strain), budget, drive.shape[1]
-    return job
+    """Complete what kernels find in `a`."""
+    a = pointer_to_ints(job)
+    a[AT_STRAIN], a[AT_TENSION] = address_of(strain), address_of(tension)
+    a[AT_FROM_DRIVE], a[AT_FROM_LOAD], a[AT_DRIVE] = address_of(from_drive), address_of(from_load), address_of(drive)
+    a[AT_LOAD], a[AT_TIP], a[AT_LENGTHS] = address_of(load), address_of(tip), address_of(lengths)
+    a[AT_REPORT], a[AT_ACTION] = address_of(report), address_of(action) if len(action) else 0
+    a[AT_TEMPERATURE], a[AT_POWER], a[AT_HEATING] = address_of(temperature), address_of(power), address_of(constants)
+    a[COUNT], a[BUDGET], a[HEATED] = len(strain), budget, drive.shape[1]
 
 
-@inner
+@merged
 def _solve_pack(f, i, job, w, n, first):
-    ff, ii, a = pointer_to_floats(f), pointer_to_ints(i), pointer_to_ints(job)
-    if job[AT_ACTION] != 0:
-        call_kernel(job[HEAT], ff, ii, a, w, n, 0.0)
-    call_kernel(job[LANES], ff, ii, a, w, n, first)
+    """Do pack `n` of the lanes."""
+    ff, ii, a, ww = pointer_to_floats(f), pointer_to_ints(i), pointer_to_ints(job), pointer_to_packs(w)
+    if a[AT_ACTION] != 0:
+        call_kernel(a[HEAT], ff, ii, a, ww, n, 0.0)
+    call_kernel(a[LANES], ff, ii, a, ww, n, first)
 
 
 @entry
 def _solve_serially(
-    f, i, addresses, w, budget, first, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action,
+    f, i, job, w, budget, first, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action,
     temperature, power, constants,
 ):  # fmt: skip
-    job = _job(
-        addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report,
+    _fill(
+        job, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report,
         action, temperature, power, constants,
     )  # fmt: skip
     for n in range((len(strain) + PACK - 1) // PACK):
-        _solve_pack(f, i, job, pointer_to_packs(w), n, first)
+        _solve_pack(f, i, job, w, n, first)
 
 
 @parallel
 def _solve_in_parallel(
-    f, i, addresses, w, budget, first, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action,
+    f, i, job, w, budget, first, strain, tension, from_drive, from_load, drive, load, tip, lengths, report, action,
     temperature, power, constants,
 ):  # fmt: skip
-    job = _job(
-        addresses, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report,
+    _fill(
+        job, budget, strain, tension, from_drive, from_load, drive, load, tip, lengths, report,
         action, temperature, power, constants,
     )  # fmt: skip
     for n in prange((len(strain) + PACK - 1) // PACK):
-        _solve_pack(f, i, job, pointer_to_packs(w[get_thread_id()]), n, first)
+        _solve_pack(f, i, job, w[get_thread_id()], n, first)
 
 
 def linearise(model, strain, tension, drive, load, damping, slaved, ask, given):
@@ -300,90 +354,104 @@ def linearise(model, strain, tension, drive, load, damping, slaved, ask, given):
 
 
 @entry
-def _linearise(f, i, addresses, w, tension, load, damping, slaved, ask, given, numbers, tips):
-    """`linearise` of the state in all places of `w`; fills `tension`, `numbers` and `tips`."""
-    ff, ii, aa, ww = pointer_to_floats(f), pointer_to_ints(i), pointer_to_ints(addresses), pointer_to_packs(w)
-    nodes, n, law = i[kernels.NODES], i[kernels.MUSCLES], i[kernels.LAW]
-    parameters = f[law : law + n * PARAMETERS].reshape((n, PARAMETERS))
-    kind, rest = i[i[kernels.KIND] : i[kernels.KIND] + n], f[i[kernels.REST] : i[kernels.REST] + n]
-    paths = w[i[kernels.PATHS] : i[kernels.PATHS] + n]
-    gap = w[i[kernels.GAP] : i[kernels.GAP] + n]
-    residual = w[i[kernels.RESIDUAL] : i[kernels.RESIDUAL] + 6 * nodes]
-    drive = w[i[kernels.DRIVE] : i[kernels.DRIVE] + n]
-    w[i[kernels.ACTIVE]] = 1.0
+def _linearise(model_f, model_i, addresses, packs, tensions, load, damping, slaved, ask, given, numbers, tips):
+    """`linearise` of the state in all places of `packs`; fills `tensions`, `numbers` and `tips`."""
+    f, i, a, w = pointer_to_floats(model_f), pointer_to_ints(model_i), pointer_to_ints(addresses), pointer_to_packs(packs)
+    y, tension, out = floats_of(w), pointer_to_floats(tensions), pointer_to_floats(numbers)
+    imbalance, tip, columns = pointer_to_floats(given), pointer_to_floats(tips), tips.shape[1]
+    nodes, muscles, kinds, rests, law_at = i[NODES], i[MUSCLES], i[KIND], i[REST], i[LAW]
+    paths, drives, gap, residual = i[PATHS], i[DRIVE], i[GAP], i[RESIDUAL]
+    w[i[ACTIVE]] = spread(1.0)
     for again in range(2 if slaved else 1):
-        call_kernel(aa[kernels.EVALUATE], ff, ii, aa, ww, again, 0.0)
-        numbers[0], numbers[1] = w[i[kernels.WORST], 0], w[i[kernels.TOTAL], 0]
-        for m in range(n):
-            if kind[m] == TENDON:
-                tension[m] = drive[m, 0]
-            elif slaved and again == 0 and numbers[0] < np.inf:
-                tension[m] = pull(kind[m], parameters, m, rest[m], paths[m, 0], drive[m, 0], tension[m])
-                w[i[kernels.TENSION] + m] = tension[m]
-    numbers[3] = 1.0  # what is no configuration is not stable
-    if not numbers[0] < np.inf:
+        call_kernel(a[EVALUATE], f, i, a, w, again, 0.0)
+        out[0], out[1] = y[i[WORST] * PACK], y[i[TOTAL] * PACK]
+        for m in range(muscles):
+            kind, drive = i[kinds + m], y[(drives + m) * PACK]
+            if kind == TENDON:
+                tension[m] = drive
+            elif slaved and again == 0 and out[0] < np.inf:
+                tension[m] = pull(kind, f, law_at + PARAMETERS * m, f[rests + m], y[(paths + m) * PACK], drive, tension[m])
+                w[i[TENSION] + m] = spread(tension[m])
+    out[3] = 1.0  # what is no configuration is not stable
+    if not out[0] < np.inf:
         return
-    numbers[2], numbers[3] = _energy(f, i, w, kind, parameters, rest, tension, load), 0.0
+    out[3] = 0.0
     if ask != SHAPE:
-        call_kernel(aa[kernels.ELIMINATE], ff, ii, aa, ww, 0, damping)
-        numbers[3] = w[i[kernels.INDEX], 0]
+        call_kernel(a[ELIMINATE], f, i, a, w, 0, damping)
+        out[3] = y[i[INDEX] * PACK]
     if ask >= GIVEN:
-        gap[:] = 0.0
-        for g in range(nodes):
-            for d in range(6):
-                residual[6 * g + d] = given[g, d] if ask == GIVEN else 0.0
-    columns = tips.shape[1]
+        for m in range(muscles):
+            w[gap + m] = spread(0.0)
+        for d in range(6 * nodes):
+            w[residual + d] = spread(imbalance[d] if ask == GIVEN else 0.0)
     for m in range(columns):
         if ask == JACOBIAN:
-            if kind[m] == TENDON:
-                gap[m] = 1.0  # its row reads -dF = -gap
-            else:
-                gap[m] = -elongation(kind[m], parameters, m, rest[m], tension[m], drive[m, 0])[2]
-        call_kernel(aa[kernels.SUBSTITUTE], ff, ii, aa, ww, 0, 0.0)
-        numbers[4], numbers[5] = w[i[kernels.ROTATED], 0], w[i[kernels.SHEARED], 0]
+            wanted = 1.0  # a tendon's row reads -dF = -gap
+            if i[kinds + m] != TENDON:
+                _, _, slope = law(i[kinds + m], f, law_at + PARAMETERS * m, f[rests + m], tension[m], y[(drives + m) * PACK])
+                wanted = -slope
+            w[gap + m] = spread(wanted)
+        call_kernel(a[SUBSTITUTE], f, i, a, w, 0, 0.0)
+        out[4], out[5] = y[i[ROTATED] * PACK], y[i[SHEARED] * PACK]
         for d in range(6):
-            tips[d, m] = w[i[kernels.TIP] + d, 0]
+            tip[d * columns + m] = y[(i[TIP] + d) * PACK]
         if ask == JACOBIAN:
-            gap[m] = 0.0
-    if columns == 0:
-        return
+            w[gap + m] = spread(0.0)
+    # Energies: rod and muscles store them, loads lose them.
+    total = work = extent = 0.0
     g = 0
-    for k in range(i[kernels.MODULES]):
-        q = i[i[kernels.NODES_OF] + k]
-        h = f[i[kernels.LENGTH] + k] / i[i[kernels.PIECES] + k]
-        for node in range(i[i[kernels.PIECES] + k] * q):
-            weight = h * f[i[kernels.B] + k * i[kernels.WIDE] + node % q]
-            for d in range(3):
-                bend, shear = w[i[kernels.BEND] + 3 * g + d, 0], w[i[kernels.SHEAR] + 3 * g + d, 0]
-                stiffness = i[kernels.STIFFNESS] + 6 * k + d
-                numbers[6] += weight * (residual[6 * g + d, 0] * bend + residual[6 * g + 3 + d, 0] * shear)
-                numbers[7] += weight * (f[stiffness] * bend**2 + f[stiffness + 3] * shear**2)
+    for k in range(i[MODULES]):
+        q = i[i[NODES_OF] + k]
+        h = f[i[LENGTH] + k] / i[i[PIECES] + k]
+        for node in range(i[i[PIECES] + k] * q):
+            weight = h * f[i[B] + k * i[WIDE] + node % q]
+            total += weight * _density(f, y, i[STIFFNESS] + 6 * k, i[REFERENCE] + 6 * k, i[STRAIN] + 6 * g, i[FORCE] + 3 * g)
+            if columns > 0:
+                done, size = _step(f, y, i[STIFFNESS] + 6 * k, residual + 6 * g, i[BEND] + 3 * g, i[SHEAR] + 3 * g)
+                work += weight * done
+                extent += weight * size
             g += 1
+    for m in range(muscles):
+        kind, path = i[kinds + m], y[(paths + m) * PACK]
+        total += stored(kind, f, law_at + PARAMETERS * m, f[rests + m], tension[m], path)
+    out[2] = total - _lifted(y, i[ENDS] + 4 * i[ELEMENTS], pointer_to_floats(load))
+    out[6], out[7] = work, extent
 
 
-@inner
-def _energy(f, i, w, kind, parameters, rest, tension, load):
-    """Return the total energy [J] of the state last given to `evaluate`, without a tip moment, which has no potential.
+@traced
+def _three(y, place):
+    """Return three numbers of the first arm of the packs."""
+    return y[PACK * place], y[PACK * (place + 1)], y[PACK * (place + 2)]
 
-    Rod and muscles store it, loads lose it: int n . p' ds is the work of the tip force and of all weights but the lever of the
-    payload's.
+
+@traced
+def _weighted(f, at, x):
+    """Return x . K x of half a strain, with its stiffness from place `at` on."""
+    return f[at] * x[0] * x[0] + f[at + 1] * x[1] * x[1] + f[at + 2] * x[2] * x[2]
+
+
+@traced
+def _density(f, y, stiffness, reference, strain, force):
+    """Return a section's energy per metre [N].
+
+    int n . p' ds is the work of the tip force and of all weights but the lever of the payload's. A tip moment has no potential.
     """
-    total, g = 0.0, 0
-    for k in range(i[kernels.MODULES]):
-        q = i[i[kernels.NODES_OF] + k]
-        h = f[i[kernels.LENGTH] + k] / i[i[kernels.PIECES] + k]
-        for node in range(i[i[kernels.PIECES] + k] * q):
-            density = 0.0
-            for d in range(3):
-                density -= w[i[kernels.FORCE] + 3 * g + d, 0] * w[i[kernels.STRAIN] + 6 * g + 3 + d, 0]
-            for d in range(6):
-                off = w[i[kernels.STRAIN] + 6 * g + d, 0] - f[i[kernels.REFERENCE] + 6 * k + d]
-                density += 0.5 * f[i[kernels.STIFFNESS] + 6 * k + d] * off**2
-            total += h * f[i[kernels.B] + k * i[kernels.WIDE] + node % q] * density
-            g += 1
-    end = i[kernels.ENDS] + 4 * i[kernels.ELEMENTS]
-    lever = apply(rotation_matrix((w[end, 0], w[end + 1, 0], w[end + 2, 0], w[end + 3, 0])), (load[10], load[11], load[12]))
-    total -= load[PAYLOAD_MASS] * dot(lever, (load[6], load[7], load[8]))
-    for m in range(tension.size):
-        total += stored(kind[m], parameters, m, rest[m], tension[m], w[i[kernels.PATHS] + m, 0])
-    return total
+    v = _three(y, strain + 3)
+    du, dv = axpy(-1.0, get3(f, reference), _three(y, strain)), axpy(-1.0, get3(f, reference + 3), v)
+    return 0.5 * (_weighted(f, stiffness, du) + _weighted(f, stiffness + 3, dv)) - dot(_three(y, force), v)
+
+
+@traced
+def _step(f, y, stiffness, residual, bend, shear):
+    """Return g . dx and dx . K dx of a step per metre [N]."""
+    du, dv = _three(y, bend), _three(y, shear)
+    work = dot(_three(y, residual), du) + dot(_three(y, residual + 3), dv)
+    return work, _weighted(f, stiffness, du) + _weighted(f, stiffness + 3, dv)
+
+
+@traced
+def _lifted(y, end, load):
+    """Return the work that the payload's weight does on its lever [J]."""
+    x, z = _three(y, end), _three(y, end + 1)
+    lever = apply(rotation_matrix((x[0], x[1], x[2], z[2])), get3(load, PAYLOAD_MASS + 1))
+    return load[PAYLOAD_MASS] * dot(lever, get3(load, 6))

@@ -15,7 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from tca_envs.mechanics import check
 from tca_envs.mechanics.algebra import entry
 from tca_envs.mechanics.arm import Arm, Module
-from tca_envs.mechanics.muscle import PARAMETERS, TCA, Muscle, elongation
+from tca_envs.mechanics.muscle import TCA, Muscle, law
+from tca_envs.mechanics.packs import pointer_to_floats
+from tca_envs.mechanics.traced import size
 
 Array = NDArray[np.float64]
 
@@ -30,15 +32,16 @@ def ring_tension(kind, parameters, length, rest_length, compliance, temperature,
     compliance = 1/EA + r^2/EI. So elongation(F, T) + F length compliance = 0, which rises with F and bends down: Newton from
     F = 0 comes from the left and cannot overshoot. For F < 0 (slack) the law is linear and one step is exact.
     """
-    for i in range(temperature.size):
+    f, given, found = pointer_to_floats(parameters), pointer_to_floats(temperature), pointer_to_floats(tension)
+    for i in range(tension.size):
         force = 0.0
         for _ in range(ITERATIONS):
-            delta, softness, _ = elongation(kind, parameters, 0, rest_length, force, temperature[i])
+            delta, softness, _ = law(kind, f, 0, rest_length, force, given[i])
             step = (delta + force * length * compliance) / (softness + length * compliance)
             force -= step
-            if abs(step) < 1e-14:
+            if size(step) < 1e-14:
                 break
-        tension[i] = force
+        found[i] = force
 
 
 @dataclass(frozen=True)
@@ -89,8 +92,7 @@ class Gripper:
         given = self._checked(temperature)
         result = np.empty(given.size)
         compliance = 1.0 / self.axial_stiffness + self.offset**2 / self.bending_stiffness
-        parameters = self.law.parameters().reshape(1, PARAMETERS)
-        ring_tension(self.law.kind, parameters, self.length, self.rest_length, compliance, given.ravel(), result)
+        ring_tension(self.law.kind, self.law.parameters(), self.length, self.rest_length, compliance, given.ravel(), result)
         return result.reshape(given.shape)
 
     def gap(self, temperature: ArrayLike) -> Array:

@@ -22,10 +22,9 @@ so loops are written out: they beat library calls here.
 """
 
 import numpy as np
-from numba import carray, njit
 
 from tca_envs.mechanics.algebra import (
-    INNER,
+    ORIGIN,
     apply,
     apply_transposed,
     axpy,
@@ -40,22 +39,12 @@ from tca_envs.mechanics.algebra import (
     quaternion_rate,
     quaternion_turn,
     rotation_matrix,
+    scalar_matrix,
     transpose,
 )
-from tca_envs.mechanics.muscle import PARAMETERS, TENDON, elongation
-from tca_envs.mechanics.packs import (
-    PACK,
-    behind,
-    call_kernel,
-    choose,
-    floats_at,
-    floats_of,
-    part,
-    replaced,
-    root,
-    size,
-    spread,
-)
+from tca_envs.mechanics.muscle import PARAMETERS, TENDON, law
+from tca_envs.mechanics.packs import call_kernel, floats_at, floats_of
+from tca_envs.mechanics.traced import PACK, choose, part, root, size, spread, traced
 
 # A load is (13,): tip force [N] and tip moment [N m] in the global frame, gravity [m/s2],
 # payload mass [kg] and its centre in the tip's frame [m].
@@ -136,72 +125,69 @@ def layout(modules: int, n: int, nodes: int, elements: int, wide: int, most: int
     )  # fmt: skip
 
 
-small = njit(forceinline=True, **INNER)
-
-
-@small
+@traced
 def get3(w, k):
     """Return three packs."""
     return w[k], w[k + 1], w[k + 2]
 
 
-@small
+@traced
 def put3(w, k, x):
     """Set three packs."""
     w[k], w[k + 1], w[k + 2] = x
 
 
-@small
+@traced
 def get4(w, k):
     """Return four packs."""
     return w[k], w[k + 1], w[k + 2], w[k + 3]
 
 
-@small
+@traced
 def put4(w, k, x):
     """Set four packs."""
     w[k], w[k + 1], w[k + 2], w[k + 3] = x
 
 
-@small
+@traced
 def get9(w, k):
     """Return nine packs."""
     return w[k], w[k + 1], w[k + 2], w[k + 3], w[k + 4], w[k + 5], w[k + 6], w[k + 7], w[k + 8]
 
 
-@small
+@traced
 def put9(w, k, x):
     """Set nine packs."""
     w[k], w[k + 1], w[k + 2], w[k + 3], w[k + 4], w[k + 5], w[k + 6], w[k + 7], w[k + 8] = x
 
 
-@small
+@traced
 def zero3():
     """Return three packs of zeros."""
     nothing = spread(0.0)
     return nothing, nothing, nothing
 
 
-@small
+@traced
 def diagonal(x, y, z):
     """Return a diagonal matrix of packs."""
     nothing = spread(0.0)
     return x, nothing, nothing, nothing, y, nothing, nothing, nothing, z
 
 
-@small
+@traced
 def largest(x, y):
     """Return the larger numbers, x where y is not a number."""
     return choose(x, y, y, x)
 
 
-@small
+@traced
 def any_of(x):
     """Return whether a flag (0 or 1) is set for any arm."""
     return part(x, 0) + part(x, 1) + part(x, 2) + part(x, 3) > 0.5
 
 
-@small
+@traced
 def across(n, b):
     """Return [n] b: n x b, column by column."""
     x = cross(n, (b[0], b[3], b[6]))
@@ -210,13 +196,13 @@ def across(n, b):
     return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
 
 
-@small
+@traced
 def add_cross(n, b):
     """Return [n] + b."""
     return b[0], b[1] - n[2], b[2] + n[1], b[3] + n[2], b[4], b[5] - n[0], b[6] - n[1], b[7] + n[0], b[8]
 
 
-@small
+@traced
 def negatives(a):
     """Return how many eigenvalues of a symmetric matrix are negative, by Descartes' rule; 3 if it is not finite."""
     trace = a[0] + a[4] + a[8]
@@ -224,6 +210,38 @@ def negatives(a):
     det = a[0] * (a[4] * a[8] - a[5] * a[7]) - a[1] * (a[3] * a[8] - a[5] * a[6]) + a[2] * (a[3] * a[7] - a[4] * a[6])
     first, second, third = choose(trace, 0.0, 1.0, 0.0), choose(minors, 0.0, 1.0, 0.0), choose(det, 0.0, 1.0, 0.0)
     return choose(size(det), np.inf, first + size(first - second) + size(second - third), 3.0)
+
+
+@traced
+def along(x, y, dx, dy, u, v):
+    """Return the unit tangent of a muscle's path at the lever (x, y, 0), and the path's length per metre of centerline."""
+    p = (v[0] - u[2] * y + dx, v[1] + u[2] * x + dy, v[2] + u[0] * y - u[1] * x)
+    norm = root(dot(p, p))
+    return axpy(1.0 / norm, p, ORIGIN), norm
+
+
+@traced
+def about(x, y, t):
+    """Return the moment r x t of a muscle's tangent with the lever r = (x, y, 0)."""
+    return y * t[2], -x * t[2], x * t[1] - y * t[0]
+
+
+@traced
+def stiffened(x, y, t, pull, uu, vu, vv):
+    """Add what a muscle's pull, tension by path length per metre of centerline, adds to a section's stiffness."""
+    p = axpy9(-pull, outer(t, t), scalar_matrix(pull))
+    # P [-r] with the lever r = (x, y, 0), and below [r] times that.
+    pa = (
+        y * p[2], -x * p[2], x * p[1] - y * p[0],
+        y * p[5], -x * p[5], x * p[4] - y * p[3],
+        y * p[8], -x * p[8], x * p[7] - y * p[6],
+    )  # fmt: skip
+    around = (
+        y * pa[6], y * pa[7], y * pa[8],
+        -x * pa[6], -x * pa[7], -x * pa[8],
+        x * pa[3] - y * pa[0], x * pa[4] - y * pa[1], x * pa[5] - y * pa[2],
+    )  # fmt: skip
+    return axpy9(1.0, around, uu), axpy9(1.0, pa, vu), axpy9(1.0, p, vv)
 
 
 @merged
@@ -364,15 +382,12 @@ def evaluate(f, i, a, w, guessed, __):
                 for c in range(mk):
                     at = route + 4 * (g * most + c)
                     x, y = f[at], f[at + 1]
-                    t = (v[0] - u[2] * y + f[at + 2], v[1] + u[2] * x + f[at + 3], v[2] + u[0] * y - u[1] * x)
-                    norm = root(dot(t, t))
+                    t, norm = along(x, y, f[at + 2], f[at + 3], u, v)
                     fine = choose(1e-9, norm, fine, 0.0)
-                    t = axpy(1.0 / norm, t, zero3())
-                    put3(w, path + 4 * (g * most + c), t)
-                    w[path + 4 * (g * most + c) + 3] = norm
+                    put4(w, path + 4 * (g * most + c), (t[0], t[1], t[2], norm))
                     w[paths + i0 + c] += h * f[b + j] * norm
                     pull = w[tension + i0 + c]
-                    ru = axpy(pull, (y * t[2], -x * t[2], x * t[1] - y * t[0]), ru)
+                    ru = axpy(pull, about(x, y, t), ru)
                     rv = axpy(pull, t, rv)
                 put3(w, residual + 6 * g, ru)
                 put3(w, residual + 6 * g + 3, rv)
@@ -385,16 +400,13 @@ def evaluate(f, i, a, w, guessed, __):
                     total += share * share
             for j in range(q):
                 m_end = axpy(h * f[b + j], get3(w, spin + 3 * (g0 + j)), m_end)
-    law = carray(behind(f, i[LAW]), (muscles, PARAMETERS))
     for muscle in range(muscles):
         kind, rest = i[i[KIND] + muscle], f[i[REST] + muscle]
         gap, soft = spread(0.0), spread(1.0)
         if kind != TENDON:
             pull, heat, length = w[tension + muscle], w[drive + muscle], w[paths + muscle]
-            for lane in range(PACK):
-                delta, softness, _ = elongation(kind, law, muscle, rest, part(pull, lane), part(heat, lane))
-                gap = replaced(gap, lane, part(length, lane) - rest - delta)
-                soft = replaced(soft, lane, softness)
+            delta, soft, _ = law(kind, f, i[LAW] + PARAMETERS * muscle, rest, pull, heat)
+            gap = length - rest - delta
             share = size(gap) * (1.0 / rest)
             worst = largest(worst, share)
             total += share * share
@@ -425,27 +437,10 @@ def _section(f, i, w, k, g, j, damping):
         at = i[ROUTE] + 4 * (g * most + c)
         x, y = f[at], f[at + 1]
         t = get3(w, i[PATH] + 4 * (g * most + c))
-        put3(w, i[WRENCH] + 6 * (g * most + c), (y * t[2], -x * t[2], x * t[1] - y * t[0]))
+        put3(w, i[WRENCH] + 6 * (g * most + c), about(x, y, t))
         put3(w, i[WRENCH] + 6 * (g * most + c) + 3, t)
         pull = w[i[TENSION] + i0 + c] / w[i[PATH] + 4 * (g * most + c) + 3]
-        p = axpy9(-pull, outer(t, t), diagonal(pull, pull, pull))
-        # P [-r] with the lever r = (x, y, 0), and below [r] times that.
-        pa = (
-            y * p[2], -x * p[2], x * p[1] - y * p[0],
-            y * p[5], -x * p[5], x * p[4] - y * p[3],
-            y * p[8], -x * p[8], x * p[7] - y * p[6],
-        )  # fmt: skip
-        vv = axpy9(1.0, p, vv)
-        vu = axpy9(1.0, pa, vu)
-        uu = axpy9(
-            1.0,
-            (
-                y * pa[6], y * pa[7], y * pa[8],
-                -x * pa[6], -x * pa[7], -x * pa[8],
-                x * pa[3] - y * pa[0], x * pa[4] - y * pa[1], x * pa[5] - y * pa[2],
-            ),
-            uu,
-        )  # fmt: skip
+        uu, vu, vv = stiffened(x, y, t, pull, uu, vu, vv)
     flexibility = inverse(vv)
     slide = matmul(flexibility, vu)
     gain = transpose(slide)

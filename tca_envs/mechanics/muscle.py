@@ -1,7 +1,7 @@
 """Muscles: where they run in a module, and their laws (elongation as a function of tension and drive).
 
-A law is one class here with three parts: a `kind`, the numbers that the compiled kernels read (`parameters`) and a branch
-in `elongation`. Another muscle (an SMA wire, a pneumatic one) is one class and one branch more; nothing else changes.
+A law is one class here with three parts: a `kind`, the numbers that the compiled kernels read (`parameters`) and its formula
+in `law`. Another muscle (an SMA wire, a pneumatic one) is one class and one formula more; nothing else changes.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tca_envs.mechanics import check
-from tca_envs.mechanics.algebra import entry, inner
+from tca_envs.mechanics.algebra import entry, merged
+from tca_envs.mechanics.packs import pointer_to_floats
+from tca_envs.mechanics.traced import choose, size, traced, where
 
 TENDON, SPRING, COIL = 0, 1, 2
 PARAMETERS = 11
@@ -22,7 +24,7 @@ REFERENCE_LENGTH = 0.045
 
 @entry
 def elongation(kind, parameters, i, rest_length, tension, drive):
-    """Elongation of a muscle over its rest length, and its derivatives (compiled; the laws' one source of truth).
+    """Elongation of a muscle over its rest length, and its derivatives (compiled).
 
     Parameters
     ----------
@@ -44,51 +46,70 @@ def elongation(kind, parameters, i, rest_length, tension, drive):
     tuple of float
         Elongation [m], d elongation/d tension [m/N], d elongation/d drive. A tendon has no elongation law: zeros.
     """
-    if kind == COIL:
-        # Erratum of eqs. (23), (24): tension lengthens the coil, hence "+ C F/G_t".
-        scale = rest_length / parameters[i, 0]
-        x = drive - parameters[i, 9]
-        x0 = parameters[i, 10] - parameters[i, 9]
-        untwist = (parameters[i, 6] * x + parameters[i, 7]) * x - (parameters[i, 6] * x0 + parameters[i, 7]) * x0
-        heated = parameters[i, 1] * untwist
-        heated_slope = parameters[i, 1] * (2.0 * parameters[i, 6] * x + parameters[i, 7])
-        # Beyond the measured range the tangent at its end continues the curve: the law stays monotone.
-        inside = min(max(tension, 0.0), parameters[i, 8])
-        modulus = parameters[i, 3] + (parameters[i, 4] + parameters[i, 5] * inside) * inside
-        slope = parameters[i, 2] * (parameters[i, 3] - parameters[i, 5] * inside * inside) / (modulus * modulus)
-        stretch = parameters[i, 2] * inside / modulus + slope * (tension - inside)
-        return scale * (heated + stretch), scale * slope, scale * heated_slope
-    if kind == SPRING:
-        return drive + tension / parameters[i, 0] - rest_length, 1.0 / parameters[i, 0], 1.0
-    return 0.0, 0.0, 0.0
+    return law(kind, pointer_to_floats(parameters), PARAMETERS * i, rest_length, tension, drive)
 
 
-@inner
-def pull(kind, parameters, i, rest_length, length, drive, guess):
+@traced
+def _within(tension, most):
+    """Return the tension of the measured range, 0 to `most`, that is nearest."""
+    return choose(tension, 0.0, 0.0, choose(most, tension, most, tension))
+
+
+@traced
+def law(kind, f, at, rest_length, tension, drive):
+    """Return what `elongation` returns for kernels, of numbers or packs; the law's numbers begin at place `at` of `f`.
+
+    All laws are computed, and the results of those that a muscle does not follow are dropped.
+    """
+    gain, compliance, g0, g1, g2 = f[at + 1], f[at + 2], f[at + 3], f[at + 4], f[at + 5]
+    a, b, most, zero = f[at + 6], f[at + 7], f[at + 8], f[at + 9]
+    # Erratum of eqs. (23), (24): tension lengthens the coil, hence "+ C F/G_t".
+    scale = rest_length / f[at]
+    x, x0 = drive - zero, f[at + 10] - zero
+    heated = gain * ((a * x + b) * x - (a * x0 + b) * x0)
+    # Beyond the measured range the tangent at its end continues the curve: the law stays monotone.
+    inside = _within(tension, most)
+    modulus = g0 + (g1 + g2 * inside) * inside
+    slope = compliance * (g0 - g2 * inside * inside) / (modulus * modulus)
+    stretch = compliance * inside / modulus + slope * (tension - inside)
+    coil, spring, rate = kind == COIL, kind == SPRING, 1.0 / f[at]
+    return (
+        where(coil, scale * (heated + stretch), where(spring, drive + tension * rate - rest_length, 0.0)),
+        where(coil, scale * slope, where(spring, rate, 0.0)),
+        where(coil, scale * (gain * (2.0 * a * x + b)), where(spring, 1.0, 0.0)),
+    )
+
+
+@merged
+def pull(kind, f, at, rest_length, length, drive, guess):
     """Return the tension [N] at which a muscle, no tendon, has a path length [m]: Newton, for elongation grows with tension."""
     tension = guess
     for _ in range(60):
-        delta, softness, _ = elongation(kind, parameters, i, rest_length, tension, drive)
+        delta, softness, _ = law(kind, f, at, rest_length, tension, drive)
         step = (length - rest_length - delta) / softness
         tension += step
-        if abs(step) <= 1e-14 + 1e-13 * abs(tension):
+        if size(step) <= 1e-14 + 1e-13 * size(tension):
             break
     return tension
 
 
-@inner
-def stored(kind, parameters, i, rest_length, tension, length):
+@merged
+def stored(kind, f, at, rest_length, tension, length):
     """Return the energy [J] in a muscle at a tension: int F dl over the lengths, which is int f (dl/df) df; F l of a tendon."""
-    if kind == TENDON:
-        return tension * length
-    # Simpson's rule inside the measured range; the law is linear outside.
-    inside = min(max(tension, 0.0), parameters[i, 8]) if kind == COIL else tension
-    h, total = inside / 32.0, 0.0
-    for k in range(33):
-        weight = 1.0 if k in (0, 32) else (4.0 if k % 2 else 2.0)
-        total += weight * k * h * elongation(kind, parameters, i, rest_length, k * h, 0.0)[1]
-    end = elongation(kind, parameters, i, rest_length, tension, 0.0)[1]
-    return total * h / 3.0 + 0.5 * end * (tension * tension - inside * inside)
+    energy = tension * length
+    if kind != TENDON:
+        # Simpson's rule inside the measured range; the law is linear outside.
+        inside = _within(tension, f[at + 8]) if kind == COIL else tension
+        h, total = inside / 32.0, 0.0
+        for k in range(33):
+            weight = 4.0 if k % 2 == 1 else 2.0
+            if k == 0 or k == 32:
+                weight = 1.0
+            _, softness, _ = law(kind, f, at, rest_length, k * h, 0.0)
+            total += weight * k * h * softness
+        _, softness, _ = law(kind, f, at, rest_length, tension, 0.0)
+        energy = total * h / 3.0 + 0.5 * softness * (tension * tension - inside * inside)
+    return energy
 
 
 class Law(Protocol):
