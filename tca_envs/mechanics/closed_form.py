@@ -38,6 +38,7 @@ from tca_envs.mechanics.kernels import (
     along,
     get3,
     get9,
+    largest,
     put3,
     put9,
     stiffened,
@@ -45,6 +46,7 @@ from tca_envs.mechanics.kernels import (
 from tca_envs.mechanics.muscle import PARAMETERS, TENDON, law
 from tca_envs.mechanics.packs import pointer_to_floats, pointer_to_ints
 from tca_envs.mechanics.traced import choose, cosine, root, sine, size, traced
+from tca_envs.mechanics.written import written
 
 Array = NDArray[np.float64]
 
@@ -52,9 +54,9 @@ MAX_ITERATIONS = 30
 MAX_STEP = 0.5
 """Of the rotation over a module [rad] and of the rest of the strain."""
 ROUND_OFF = 1e-12
-STRAIN, POSITION, ROTATION, RHS = 0, 6, 9, 18
-"""Places of the numbers that are worked on: a module's strain, the pose at its base, Newton's right-hand side and, behind
-it, his matrix."""
+STRAIN, POSITION, ROTATION, RESIDUAL, ITERATIONS, RHS = 0, 6, 9, 18, 19, 20
+"""Places of the numbers that are worked on: a module's strain, the pose at its base, the largest residual and number of
+iterations of a module, Newton's right-hand side and, behind it, his matrix."""
 
 
 class Sections(NamedTuple):
@@ -116,13 +118,20 @@ def _put_column(w, at, order, moment, force):
 
 
 @entry
-def _solve(model_f, model_i, route, turn, arc, drive, tension, strain, path, work):
-    """Fill strain, tension, path and, in `work`, the pose of the tip; return residual (inf: no answer) and iterations."""
-    f, i, w = pointer_to_floats(model_f), pointer_to_ints(model_i), pointer_to_floats(work)
-    routes, turns, arcs = pointer_to_floats(route), pointer_to_floats(turn), pointer_to_floats(arc)
-    drives, pulls = pointer_to_floats(drive), pointer_to_floats(tension)
-    strains, paths = pointer_to_floats(strain), pointer_to_floats(path)
-    largest, most, g = 0.0, 0, 0
+def _solve(f, i, route, turn, arc, drive, tension, strain, path, work):
+    """Fill strain, tension and path; `work` holds the residual (inf: no answer), iterations and pose of the tip then."""
+    _solved(
+        pointer_to_floats(f), pointer_to_ints(i), pointer_to_floats(route), pointer_to_floats(turn), pointer_to_floats(arc),
+        pointer_to_floats(drive), pointer_to_floats(tension), pointer_to_floats(strain), pointer_to_floats(path),
+        pointer_to_floats(work),
+    )  # fmt: skip
+
+
+@written
+def _solved(f, i, routes, turns, arcs, drives, pulls, strains, paths, w):
+    """Do what `_solve` does, given pointers."""
+    w[RESIDUAL], w[ITERATIONS] = np.inf, 0.0
+    worst_of_all, most, g = 0.0, 0.0, 0
     put9(w, ROTATION, scalar_matrix(1.0))
     put3(w, POSITION, ORIGIN)
     for k in range(i[MODULES]):
@@ -133,8 +142,8 @@ def _solve(model_f, model_i, route, turn, arc, drive, tension, strain, path, wor
         angle = -rate * arcs[g]
         put3(w, STRAIN, _turned(angle, get3(strains, 6 * g)))
         put3(w, STRAIN + 3, _turned(angle, get3(strains, 6 * g + 3)))
-        before = np.inf
-        for iteration in range(MAX_ITERATIONS):
+        before, count = np.inf, 0
+        for _ in range(MAX_ITERATIONS):
             # Newton's equations.
             u, v = get3(w, STRAIN), get3(w, STRAIN + 3)
             uu, vu, vv = _diagonal(f, stiffness), scalar_matrix(0.0), _diagonal(f, stiffness + 3)
@@ -148,7 +157,7 @@ def _solve(model_f, model_i, route, turn, arc, drive, tension, strain, path, wor
                 x, y = routes[at], routes[at + 1]
                 t, norm = along(x, y, routes[at + 2], routes[at + 3], u, v)
                 if not norm > 1e-9:
-                    return np.inf, iteration
+                    return
                 paths[muscle] = span * norm
                 moment, row = about(x, y, t), matrix + c * order
                 _put_column(w, matrix + c, order, moment, t)
@@ -167,15 +176,19 @@ def _solve(model_f, model_i, route, turn, arc, drive, tension, strain, path, wor
                 put3(w, RHS, axpy(-pull, moment, get3(w, RHS)))
                 put3(w, RHS + 3, axpy(-pull, t, get3(w, RHS + 3)))
             _put_blocks(w, matrix, order, uu, vu, vv)
-            worst = 0.0
-            for d in range(order):
-                scale = (span if d < 3 else 1.0) / f[stiffness + d] if d < 6 else 1.0 / f[i[REST] + i0 + d - 6]
-                share = size(w[RHS + d]) * scale
-                if not share < np.inf:
-                    return np.inf, iteration
-                worst = choose(worst, share, share, worst)
+            worst = total = 0.0
+            for d in range(6):
+                share = size(w[RHS + d]) * ((span if d < 3 else 1.0) / f[stiffness + d])
+                worst = largest(worst, share)
+                total += share
+            for c in range(6, order):
+                share = size(w[RHS + c]) / f[i[REST] + i0 + c - 6]
+                worst = largest(worst, share)
+                total += share
+            if not total < np.inf:
+                return
             # Down to round-off: the last steps cost next to nothing.
-            if worst < ROUND_OFF or (worst < 1e3 * ROUND_OFF and worst >= before):
+            if (worst < ROUND_OFF) | ((worst < 1e3 * ROUND_OFF) & (worst >= before)):
                 break
             before = worst
             # Without pivoting: the strain's block is definite, the muscles' complement negative definite.
@@ -192,15 +205,16 @@ def _solve(model_f, model_i, route, turn, arc, drive, tension, strain, path, wor
             longest = MAX_STEP
             for d in range(6):
                 length = size(w[RHS + d]) * (span if d < 3 else 1.0)
-                longest = choose(longest, length, length, longest)
+                longest = largest(longest, length)
             step = MAX_STEP / longest
             for d in range(6):
                 w[STRAIN + d] += step * w[RHS + d]
             for c in range(6, order):
                 pulls[i0 + c - 6] += step * w[RHS + c]
-        else:
-            return np.inf, MAX_ITERATIONS
-        largest, most = choose(largest, worst, worst, largest), max(most, iteration)
+            count += 1
+        if count == MAX_ITERATIONS:
+            return
+        worst_of_all, most = largest(worst_of_all, worst), largest(most, 1.0 * count)
         u, v = get3(w, STRAIN), get3(w, STRAIN + 3)
         for _ in range(i[i[PIECES] + k] * i[i[NODES_OF] + k]):
             put3(strains, 6 * g, _turned(rate * arcs[g], u))
@@ -209,7 +223,7 @@ def _solve(model_f, model_i, route, turn, arc, drive, tension, strain, path, wor
         rotation, position = _moved(get9(w, ROTATION), get3(w, POSITION), u, v, rate, span)
         put9(w, ROTATION, rotation)
         put3(w, POSITION, position)
-    return largest, most
+    w[RESIDUAL], w[ITERATIONS] = worst_of_all, most
 
 
 def solve_lane(model, sections, strain, tension, from_drive, from_load, drive, load, tip, lengths, report) -> bool:
@@ -223,10 +237,10 @@ def solve_lane(model, sections, strain, tension, from_drive, from_load, drive, l
     found, pull, path = strain[0].copy(), tension[0].copy(), np.empty_like(lengths[0])
     order = 6 + model.route.shape[1]
     work = np.empty(RHS + order + order * order)
-    residual, iterations = _solve(model.f, model.i, *sections, drive[0], pull, found, path, work)
-    if not residual < np.inf:
+    _solve(model.f, model.i, *sections, drive[0], pull, found, path, work)
+    if not work[RESIDUAL] < np.inf:
         return False
     strain[0], tension[0], lengths[0], from_drive[0], from_load[0] = found, pull, path, drive[0], load[0]
-    tip[0, :3, :3], tip[0, :3, 3] = work[ROTATION:RHS].reshape(3, 3), work[POSITION:ROTATION]
-    report[0] = CLOSED_FORM, residual, iterations, 0.0, 0.0
+    tip[0, :3, :3], tip[0, :3, 3] = work[ROTATION:RESIDUAL].reshape(3, 3), work[POSITION:ROTATION]
+    report[0] = CLOSED_FORM, work[RESIDUAL], work[ITERATIONS], 0.0, 0.0
     return True

@@ -83,6 +83,7 @@ from tca_envs.mechanics.packs import (
     pointer_to_packs,
 )  # fmt: skip
 from tca_envs.mechanics.traced import PACK, spread, traced
+from tca_envs.mechanics.written import written
 
 Array = NDArray[np.float64]
 
@@ -212,10 +213,7 @@ def budget(model):
 @cache
 def addresses() -> NDArray[np.int64]:
     """Return what kernels find in `a`, but for what is a lane's; compiles them, or loads them from the cache."""
-    made = (
-        kernels.evaluate, kernels.eliminate, kernels.substitute, kernels.newton, kernels.follow, kernels.heat, kernels.lanes,
-    )  # fmt: skip
-    compiled = [cfunc(KERNEL, **CALLED)(kernel) for kernel in made]
+    compiled = [cfunc(KERNEL, **CALLED)(kernel) for kernel in kernels.COMPILED]
     _KEPT.extend(compiled)
     job = np.zeros(JOB, dtype=np.int64)
     job[: len(compiled)] = np.array([kernel.address for kernel in compiled])
@@ -354,11 +352,19 @@ def linearise(model, strain, tension, drive, load, damping, slaved, ask, given):
 
 
 @entry
-def _linearise(model_f, model_i, addresses, packs, tensions, load, damping, slaved, ask, given, numbers, tips):
-    """`linearise` of the state in all places of `packs`; fills `tensions`, `numbers` and `tips`."""
-    f, i, a, w = pointer_to_floats(model_f), pointer_to_ints(model_i), pointer_to_ints(addresses), pointer_to_packs(packs)
-    y, tension, out = floats_of(w), pointer_to_floats(tensions), pointer_to_floats(numbers)
-    imbalance, tip, columns = pointer_to_floats(given), pointer_to_floats(tips), tips.shape[1]
+def _linearise(f, i, a, w, tension, load, damping, slaved, ask, given, numbers, tips):
+    """`linearise` of the state in all places of `w`; fills `tension`, `numbers` and `tips`."""
+    _evaluated(
+        pointer_to_floats(f), pointer_to_ints(i), pointer_to_ints(a), pointer_to_packs(w), pointer_to_floats(tension),
+        pointer_to_floats(load), damping, slaved, ask, pointer_to_floats(given), pointer_to_floats(numbers),
+        pointer_to_floats(tips), tips.shape[1],
+    )  # fmt: skip
+
+
+@written
+def _evaluated(f, i, a, w, tension, load, damping, slaved, ask, given, out, tip, columns):
+    """Do what `_linearise` does, given pointers."""
+    y = floats_of(w)
     nodes, muscles, kinds, rests, law_at = i[NODES], i[MUSCLES], i[KIND], i[REST], i[LAW]
     paths, drives, gap, residual = i[PATHS], i[DRIVE], i[GAP], i[RESIDUAL]
     w[i[ACTIVE]] = spread(1.0)
@@ -369,7 +375,7 @@ def _linearise(model_f, model_i, addresses, packs, tensions, load, damping, slav
             kind, drive = i[kinds + m], y[(drives + m) * PACK]
             if kind == TENDON:
                 tension[m] = drive
-            elif slaved and again == 0 and out[0] < np.inf:
+            elif slaved & (again == 0) & (out[0] < np.inf):
                 tension[m] = pull(kind, f, law_at + PARAMETERS * m, f[rests + m], y[(paths + m) * PACK], drive, tension[m])
                 w[i[TENSION] + m] = spread(tension[m])
     out[3] = 1.0  # what is no configuration is not stable
@@ -383,7 +389,7 @@ def _linearise(model_f, model_i, addresses, packs, tensions, load, damping, slav
         for m in range(muscles):
             w[gap + m] = spread(0.0)
         for d in range(6 * nodes):
-            w[residual + d] = spread(imbalance[d] if ask == GIVEN else 0.0)
+            w[residual + d] = spread(given[d] if ask == GIVEN else 0.0)
     for m in range(columns):
         if ask == JACOBIAN:
             wanted = 1.0  # a tendon's row reads -dF = -gap
@@ -414,7 +420,7 @@ def _linearise(model_f, model_i, addresses, packs, tensions, load, damping, slav
     for m in range(muscles):
         kind, path = i[kinds + m], y[(paths + m) * PACK]
         total += stored(kind, f, law_at + PARAMETERS * m, f[rests + m], tension[m], path)
-    out[2] = total - _lifted(y, i[ENDS] + 4 * i[ELEMENTS], pointer_to_floats(load))
+    out[2] = total - _lifted(y, i[ENDS] + 4 * i[ELEMENTS], load)
     out[6], out[7] = work, extent
 
 

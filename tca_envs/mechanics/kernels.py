@@ -31,10 +31,8 @@ from tca_envs.mechanics.algebra import (
     axpy9,
     cross,
     dot,
-    inner,
     inverse,
     matmul,
-    merged,
     outer,
     quaternion_rate,
     quaternion_turn,
@@ -45,6 +43,7 @@ from tca_envs.mechanics.algebra import (
 from tca_envs.mechanics.muscle import PARAMETERS, TENDON, law
 from tca_envs.mechanics.packs import call_kernel, floats_at, floats_of
 from tca_envs.mechanics.traced import PACK, choose, part, root, size, spread, traced
+from tca_envs.mechanics.written import written
 
 # A load is (13,): tip force [N] and tip moment [N m] in the global frame, gravity [m/s2],
 # payload mass [kg] and its centre in the tip's frame [m].
@@ -182,6 +181,12 @@ def largest(x, y):
 
 
 @traced
+def least(x, y):
+    """Return the smaller numbers, x where y is not a number."""
+    return choose(y, x, y, x)
+
+
+@traced
 def any_of(x):
     """Return whether a flag (0 or 1) is set for any arm."""
     return part(x, 0) + part(x, 1) + part(x, 2) + part(x, 3) > 0.5
@@ -244,7 +249,7 @@ def stiffened(x, y, t, pull, uu, vu, vv):
     return axpy9(1.0, around, uu), axpy9(1.0, pa, vu), axpy9(1.0, p, vv)
 
 
-@merged
+@written
 def _turn(f, i, w, e, g0, k, q, h, guessed):
     """Collocate the quaternion over element e, eq. (28); return 1 where the nodes can resolve the rotation, else 0.
 
@@ -254,7 +259,7 @@ def _turn(f, i, w, e, g0, k, q, h, guessed):
     """
     wide = i[WIDE]
     a, b = i[A] + k * wide * wide, i[B] + k * wide
-    close = max(1e-14, 1e-3 * f[i[TOLERANCE]])
+    close = largest(1e-14, 1e-3 * f[i[TOLERANCE]])
     q0 = get4(w, i[ENDS] + 4 * e)
     strain, quaternion, rate = i[STRAIN] + 6 * g0, i[QUATERNION] + 4 * g0, i[RATE]
     half = 0.5 * h
@@ -281,12 +286,11 @@ def _turn(f, i, w, e, g0, k, q, h, guessed):
         for j in range(q):
             h0, h1, h2, h3 = q0
             for l in range(q):
-                c = f[a + j * wide + l]
-                x = get4(w, rate + 4 * l)
-                h0 += c * x[0]
-                h1 += c * x[1]
-                h2 += c * x[2]
-                h3 += c * x[3]
+                coefficient, d = f[a + j * wide + l], get4(w, rate + 4 * l)
+                h0 += coefficient * d[0]
+                h1 += coefficient * d[1]
+                h2 += coefficient * d[2]
+                h3 += coefficient * d[3]
             old = get4(w, quaternion + 4 * j)
             new = (
                 choose(0.5, going, h0, old[0]),
@@ -305,17 +309,17 @@ def _turn(f, i, w, e, g0, k, q, h, guessed):
             break
     h0, h1, h2, h3 = q0
     for l in range(q):
-        c = f[b + l]
-        x = get4(w, rate + 4 * l)
-        h0 += c * x[0]
-        h1 += c * x[1]
-        h2 += c * x[2]
-        h3 += c * x[3]
+        coefficient, d = f[b + l], get4(w, rate + 4 * l)
+        h0 += coefficient * d[0]
+        h1 += coefficient * d[1]
+        h2 += coefficient * d[2]
+        h3 += coefficient * d[3]
     s = 1.0 / root(h0 * h0 + h1 * h1 + h2 * h2 + h3 * h3)
     put4(w, i[ENDS] + 4 * (e + 1), (s * h0, s * h1, s * h2, s * h3))
     return choose(0.5, going, 0.0, alive)
 
 
+@written
 def evaluate(f, i, a, w, guessed, __):
     """Evaluate the equilibrium equations at a state: strain, tension, drive and load at STRAIN and behind.
 
@@ -416,7 +420,7 @@ def evaluate(f, i, a, w, guessed, __):
     w[i[TOTAL]] = choose(0.5, good, total, np.inf)
 
 
-@merged
+@written
 def _section(f, i, w, k, g, j, damping):
     """Linearise the section at node g: H = K + sum_i F_i d[r x t; t]/dxi, dv eliminated; return H_vv's negative eigenvalues.
 
@@ -470,6 +474,7 @@ def _section(f, i, w, k, g, j, damping):
     return negatives(flexibility)
 
 
+@written
 def eliminate(f, i, a, w, _, damping):
     """Factorise the tangent at the state last given to `evaluate`, with `damping` times K added to it.
 
@@ -593,7 +598,9 @@ def eliminate(f, i, a, w, _, damping):
             for c2 in range(mk):
                 w[muscle + c * most + c2] = spread(0.0) if tendon else w[beta + c * most + c2]
             w[muscle + c * most + c] -= w[i[SOFTNESS] + i0 + c]
-            put3(w, follow + 3 * c, zero3() if tendon or k == 0 else get3(w, alpha + 3 * c))
+            put3(w, follow + 3 * c, zero3() if tendon else get3(w, alpha + 3 * c))
+            if k == 0:
+                put3(w, follow + 3 * c, zero3())
             put3(w, i[MUSCLE_MOMENT] + 3 * (k * most + c), get3(w, big_q + 3 * c))
         index -= _factorise(w, muscle, mk, most)
         if k > 0:
@@ -608,7 +615,7 @@ def eliminate(f, i, a, w, _, damping):
     w[i[INDEX]] = index
 
 
-@merged
+@written
 def _factorise_blocks(i, w, inside, g0, q, mk):
     """LU without pivoting, in 3 x 3 blocks, of an element's matrix; PHI (if `inside`) and PULLED become the solutions.
 
@@ -650,7 +657,7 @@ def _factorise_blocks(i, w, inside, g0, q, mk):
     return negative
 
 
-@merged
+@written
 def _factorise(w, matrix, order, stride):
     """LU without pivoting of a matrix, in place, the diagonal of U inverted; returns how many pivots are positive."""
     positive = spread(0.0)
@@ -667,7 +674,7 @@ def _factorise(w, matrix, order, stride):
     return positive
 
 
-@merged
+@written
 def _solve(w, matrix, order, stride, x):
     """Solve with the factors of `_factorise` for the packs from `x` on, in place."""
     for r in range(order):
@@ -682,6 +689,7 @@ def _solve(w, matrix, order, stride, x):
         w[x + r] = value * w[matrix + r * stride + r]
 
 
+@written
 def substitute(f, i, a, w, _, __):
     """Solve the factorised tangent for the right-hand side -(RESIDUAL, GAP).
 
@@ -788,6 +796,7 @@ def substitute(f, i, a, w, _, __):
     w[i[SHEARED]] = choose(size(dot(dp, dp)), np.inf, root(sheared), np.nan)
 
 
+@written
 def newton(f, i, a, w, certified, __):
     """Solve by Newton from the state at STRAIN, in place, each arm on the branch of equilibria that it is near.
 
@@ -867,12 +876,13 @@ def newton(f, i, a, w, certified, __):
     w[i[CONVERGED]], w[i[ITERATIONS]], w[i[SLOWNESS]] = converged, iterations, choose(LONG, first, slowness, 0.0)
 
 
-@merged
+@written
 def _copy(w, source, target, count):
     for k in range(count):
         w[target + k] = w[source + k]
 
 
+@written
 def follow(f, i, a, w, budget, first):
     """Follow the branch of equilibria of one arm, in all places of the packs, from FROM_DRIVE to TO_DRIVE, loads likewise.
 
@@ -892,7 +902,7 @@ def follow(f, i, a, w, budget, first):
     w[i[MOVED]] = spread(moved)
     slowest, spent, work, done, step, rung = 0.0, 0.0, 0.0, 0.0, first, SUBSTEPS
     while True:
-        here = min(1.0, done + step)
+        here = least(1.0, done + step)
         share = (here - done) / (1.0 - done)
         for k in range(way):
             w[i[DRIVE] + k] = w[goal + k] if here == 1.0 else w[start + k] + share * (w[goal + k] - w[start + k])
@@ -901,7 +911,7 @@ def follow(f, i, a, w, budget, first):
         spent += iterations
         work += iterations + 1.0
         if part(w[i[CONVERGED]], 0) > 0.5:
-            slowest = max(slowest, part(w[i[SLOWNESS]], 0))
+            slowest = largest(slowest, part(w[i[SLOWNESS]], 0))
             _copy(w, i[DRIVE], start, way)
             if here == 1.0:
                 step = 1.0
@@ -911,30 +921,30 @@ def follow(f, i, a, w, budget, first):
             continue
         _copy(w, good, i[STRAIN], state)
         step *= 0.5
-        if step < SMALLEST_SUBSTEP or work >= budget:
+        if (step < SMALLEST_SUBSTEP) | (work >= budget):
             rung = FAILED
-            step = min(0.5, step / (1.0 - done))
+            step = least(0.5, step / (1.0 - done))
             break
     outcome = i[OUTCOME]
-    w[outcome], w[outcome + 1], w[outcome + 2] = spread(float(rung)), spread(worst), spread(spent)
+    w[outcome], w[outcome + 1], w[outcome + 2] = spread(1.0 * rung), spread(worst), spread(spent)
     w[outcome + 3], w[outcome + 4] = spread(step), spread(slowest)
 
 
-@inner
+@written
 def _load(x, source, y, at, count, lane):
     """Put floats from place `source` on of `x` into packs from place `at` on, for one arm."""
     for k in range(count):
         y[(at + k) * PACK + lane] = x[source + k]
 
 
-@inner
+@written
 def _store(x, target, y, at, count, lane):
     """Put the floats of one arm of the packs from place `at` on into those from place `target` on of `x`."""
     for k in range(count):
         x[target + k] = y[(at + k) * PACK + lane]
 
 
-@merged
+@written
 def _tell(i, a, w, place, row):
     """Write the state of place `place` of the packs to row `row` of the lanes: an answer."""
     nodes, muscles = i[NODES], i[MUSCLES]
@@ -955,6 +965,7 @@ def _tell(i, a, w, place, row):
     tip[at + 8], tip[at + 9], tip[at + 10] = part(r[6], place), part(r[7], place), part(r[8], place)
 
 
+@written
 def heat(f, i, a, w, n, _):
     """Heat the TCAs of the lanes of pack `n` for one step: `thermal.step` at the powers asked for, under the cut-off.
 
@@ -963,7 +974,7 @@ def heat(f, i, a, w, n, _):
     heated = a[HEATED]
     action, temperature, power = floats_at(a[AT_ACTION]), floats_at(a[AT_TEMPERATURE]), floats_at(a[AT_POWER])
     constants, drive = floats_at(a[AT_HEATING]), floats_at(a[AT_DRIVE])
-    for row in range(n * PACK, min(n * PACK + PACK, a[COUNT])):
+    for row in range(n * PACK, least(n * PACK + PACK, a[COUNT])):
         for k in range(heated):
             at = row * heated + k
             kept, loss, ambient = (
@@ -971,14 +982,15 @@ def heat(f, i, a, w, n, _):
                 constants[LOSS * heated + k],
                 constants[AMBIENT_AT * heated + k],
             )
-            asked = 0.5 * (min(max(action[at], -1.0), 1.0) + 1.0) * constants[MAX_POWER * heated + k]
+            asked = 0.5 * (least(largest(-1.0, action[at]), 1.0) + 1.0) * constants[MAX_POWER * heated + k]
             end = (constants[LIMIT_AT * heated + k] - kept * temperature[at]) / constants[LOST_SHARE * heated + k]
-            given = min(asked, max(loss * (end - ambient), 0.0))
+            given = least(asked, largest(0.0, loss * (end - ambient)))
             end = ambient + given / loss
             power[at] = given
             drive[at] = end + (temperature[at] - end) * kept
 
 
+@written
 def lanes(f, i, a, w, n, first):
     """Solve the lanes of pack `n` of the arrays of `collocation.solve_lanes`: together, and stragglers one by one."""
     strains, muscles, count, drives = 6 * i[NODES], i[MUSCLES], a[COUNT], a[HEATED]
@@ -987,7 +999,7 @@ def lanes(f, i, a, w, n, first):
     from_drive, from_load = floats_at(a[AT_FROM_DRIVE]), floats_at(a[AT_FROM_LOAD])
     drive, load = floats_at(a[AT_DRIVE]), floats_at(a[AT_LOAD])
     for place in range(PACK):
-        row = min(n * PACK + place, count - 1)  # fill up with copies of the last
+        row = least(n * PACK + place, count - 1)  # fill up with copies of the last
         _load(strain, strains * row, y, i[STRAIN], strains, place)
         _load(tension, muscles * row, y, i[TENSION], muscles, place)
         _load(drive, drives * row, y, i[DRIVE], muscles, place)
@@ -1001,20 +1013,20 @@ def lanes(f, i, a, w, n, first):
                 moved = 1.0
         y[i[MOVED] * PACK + place] = moved
     lost = 0
-    rows = min(PACK, count - n * PACK)
+    rows = least(PACK, count - n * PACK)
     if first == 1.0:
         # What is heated has been solved before.
         call_kernel(a[NEWTON], f, i, a, w, 0 if a[AT_ACTION] == 0 else 1, 0.0)
         for place in range(rows):
             row = n * PACK + place
-            report[REPORT * row], report[REPORT * row + 1] = float(WARM), y[i[WORST] * PACK + place]
+            report[REPORT * row], report[REPORT * row + 1] = 1.0 * WARM, y[i[WORST] * PACK + place]
             report[REPORT * row + 2], report[REPORT * row + 3] = y[i[ITERATIONS] * PACK + place], 0.0
             report[REPORT * row + 4] = y[i[SLOWNESS] * PACK + place]
             if y[i[CONVERGED] * PACK + place] > 0.5:
                 _tell(i, a, w, place, row)
                 continue
             lost |= 1 << place
-            report[REPORT * row], report[REPORT * row + 3] = float(FAILED), FIRST_SUBSTEP
+            report[REPORT * row], report[REPORT * row + 3] = 1.0 * FAILED, FIRST_SUBSTEP
         if a[BUDGET] == 0:
             return
     else:
@@ -1022,7 +1034,7 @@ def lanes(f, i, a, w, n, first):
         for place in range(rows):
             report[REPORT * (n * PACK + place) + 2] = 0.0
     for lane in range(rows):
-        if lost & (1 << lane):
+        if lost & (1 << lane) != 0:
             row = n * PACK + lane
             for place in range(PACK):
                 _load(strain, strains * row, y, i[STRAIN], strains, place)
@@ -1044,3 +1056,35 @@ def lanes(f, i, a, w, n, first):
                 _store(tension, muscles * row, y, i[TENSION], muscles, 0)
                 _store(from_drive, muscles * row, y, i[FROM_DRIVE], muscles, 0)
                 _store(from_load, LOAD * row, y, i[FROM_LOADS], LOAD, 0)
+
+
+def _evaluate(f, i, a, w, n, x):
+    evaluate(f, i, a, w, n, x)
+
+
+def _eliminate(f, i, a, w, n, x):
+    eliminate(f, i, a, w, n, x)
+
+
+def _substitute(f, i, a, w, n, x):
+    substitute(f, i, a, w, n, x)
+
+
+def _newton(f, i, a, w, n, x):
+    newton(f, i, a, w, n, x)
+
+
+def _follow(f, i, a, w, n, x):
+    follow(f, i, a, w, n, x)
+
+
+def _heat(f, i, a, w, n, x):
+    heat(f, i, a, w, n, x)
+
+
+def _lanes(f, i, a, w, n, x):
+    lanes(f, i, a, w, n, x)
+
+
+COMPILED = (_evaluate, _eliminate, _substitute, _newton, _follow, _heat, _lanes)
+"""What Numba compiles, in the order of the first places in `a`."""

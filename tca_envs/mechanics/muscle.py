@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tca_envs.mechanics import check
-from tca_envs.mechanics.algebra import entry, merged
+from tca_envs.mechanics.algebra import entry
 from tca_envs.mechanics.packs import pointer_to_floats
 from tca_envs.mechanics.traced import choose, size, traced, where
+from tca_envs.mechanics.written import written
 
 TENDON, SPRING, COIL = 0, 1, 2
 PARAMETERS = 11
@@ -80,7 +81,7 @@ def law(kind, f, at, rest_length, tension, drive):
     )
 
 
-@merged
+@written
 def pull(kind, f, at, rest_length, length, drive, guess):
     """Return the tension [N] at which a muscle, no tendon, has a path length [m]: Newton, for elongation grows with tension."""
     tension = guess
@@ -93,7 +94,7 @@ def pull(kind, f, at, rest_length, length, drive, guess):
     return tension
 
 
-@merged
+@written
 def stored(kind, f, at, rest_length, tension, length):
     """Return the energy [J] in a muscle at a tension: int F dl over the lengths, which is int f (dl/df) df; F l of a tendon."""
     energy = tension * length
@@ -102,9 +103,7 @@ def stored(kind, f, at, rest_length, tension, length):
         inside = _within(tension, f[at + 8]) if kind == COIL else tension
         h, total = inside / 32.0, 0.0
         for k in range(33):
-            weight = 4.0 if k % 2 == 1 else 2.0
-            if k == 0 or k == 32:
-                weight = 1.0
+            weight = 1.0 if (k == 0) | (k == 32) else (4.0 if k % 2 == 1 else 2.0)
             _, softness, _ = law(kind, f, at, rest_length, k * h, 0.0)
             total += weight * k * h * softness
         _, softness, _ = law(kind, f, at, rest_length, tension, 0.0)

@@ -13,7 +13,7 @@ from typing import Any
 from llvmlite import ir
 from numba import extending, types
 
-from tca_envs.mechanics.traced import pack
+from tca_envs.mechanics.traced import as_kind, emit, pack, traced
 
 intrinsic: Any = extending.intrinsic
 
@@ -43,36 +43,27 @@ def _pointer(kind):
 pointer_to_packs, pointer_to_floats, pointer_to_ints = _pointer(packs), _pointer(floats), _pointer(ints)
 
 
-@intrinsic
-def call_kernel(typingctx, address, f, i, a, w, n, x):
+@traced
+def call_kernel(address, f, i, a, w, n, x):
     """Call a kernel of signature KERNEL by its address."""
 
-    def lower(context, builder, sig, args):
-        kind = ir.FunctionType(ir.VoidType(), [context.get_value_type(t) for t in KERNEL.args])
-        builder.call(builder.inttoptr(args[0], kind.as_pointer()), args[1:])
-        return context.get_dummy_value()
+    def write(builder, address, *values):
+        kind = ir.FunctionType(ir.VoidType(), [value.type for value in values])
+        builder.call(builder.inttoptr(address, kind.as_pointer()), values)
 
-    return types.void(types.int64, *KERNEL.args), lower
+    emit(None, write, address, f, i, a, w, as_kind(types.int64, n), as_kind(types.float64, x))
 
 
-@intrinsic
-def floats_at(typingctx, address):
+@traced
+def floats_at(address):
     """Return the pointer to floats at an address."""
-
-    def lower(context, builder, sig, args):
-        return builder.inttoptr(args[0], context.get_value_type(floats))
-
-    return floats(types.int64), lower
+    return emit(floats, lambda builder, value: builder.inttoptr(value, ir.DoubleType().as_pointer()), address)
 
 
-@intrinsic
-def floats_of(typingctx, w):
+@traced
+def floats_of(w):
     """Return the pointer to the single numbers of packs: number l of pack k is at PACK k + l."""
-
-    def lower(context, builder, sig, args):
-        return builder.bitcast(args[0], context.get_value_type(floats))
-
-    return floats(packs), lower
+    return emit(floats, lambda builder, value: builder.bitcast(value, ir.DoubleType().as_pointer()), w)
 
 
 @intrinsic

@@ -1,12 +1,13 @@
-"""Straight-line arithmetic that becomes part of the kernels that call it, without being compiled by itself.
+"""Functions that become part of the kernels that call them, without being compiled by themselves.
 
 Where a kernel calls a function that is `traced`, the function runs, as plain Python, on symbols in place of numbers, and each
-operation on a symbol writes one instruction into the kernel. So it may call what it likes, but it cannot branch or loop on a
-symbol. That takes a small share of the time for which Numba would compile the function, infer the types of the call and have
-the function optimised in each kernel anew. Called on numbers it is plain Python.
+operation on a symbol writes one instruction into the kernel. That takes a small share of the time for which Numba would
+compile the function, infer the types of the call and have the function optimised in each kernel anew. It may call what it
+likes, but it cannot branch or loop on a symbol: see `written`. Called on numbers it is plain Python.
 """
 
 import operator
+import threading
 from functools import cache
 from math import cos, sin, sqrt
 from typing import Any, TypeVar
@@ -31,7 +32,7 @@ class _Pack(types.Type):
         super().__init__("Pack")
 
 
-pack = _Pack()
+pack, pack_of_flags = _Pack(), object()
 
 
 @register_model(_Pack)
@@ -40,21 +41,27 @@ class _PackModel(models.PrimitiveModel):
         super().__init__(manager, numba_type, _VECTOR)
 
 
-_builders: list[Any] = []
-"""Of the traces that are under way, the innermost last; None where only types are asked for."""
+class _Traces(threading.local):
+    """The builders of the traces that are under way in a thread, the innermost last; None where only types are asked for."""
+
+    def __init__(self) -> None:
+        self.builders: list[Any] = []
 
 
-def _emit(kind, write, *symbols):
+traces = _Traces()
+
+
+def emit(kind, write, *symbols):
     """Return the symbol of the instruction that `write` writes for the values of symbols."""
-    builder = _builders[-1]
+    builder = traces.builders[-1]
     return Symbol(kind, None if builder is None else write(builder, *(symbol.value for symbol in symbols)))
 
 
 def _arithmetic(of_floats, of_ints):
     def operate(a, b):
         kind = _common(a, b)
-        name = of_ints if kind is types.int64 else of_floats
-        return _emit(kind, lambda builder, x, y: getattr(builder, name)(x, y), _as(kind, a), _as(kind, b))
+        name = of_ints if kind in (types.int64, types.boolean) else of_floats
+        return emit(kind, lambda builder, x, y: getattr(builder, name)(x, y), as_kind(kind, a), as_kind(kind, b))
 
     return operate, lambda a, b: operate(b, a)
 
@@ -62,9 +69,10 @@ def _arithmetic(of_floats, of_ints):
 def _comparison(sign):
     def compare(a, b):
         kind = _common(a, b)
-        name = "icmp_signed" if kind is types.int64 else "fcmp_ordered"
+        # As Python has it, what is not a number is unequal to all.
+        name = "icmp_signed" if kind is types.int64 else ("fcmp_unordered" if sign == "!=" else "fcmp_ordered")
         flag = pack_of_flags if kind is pack else types.boolean
-        return _emit(flag, lambda builder, x, y: getattr(builder, name)(sign, x, y), _as(kind, a), _as(kind, b))
+        return emit(flag, lambda builder, x, y: getattr(builder, name)(sign, x, y), as_kind(kind, a), as_kind(kind, b))
 
     return compare
 
@@ -82,33 +90,35 @@ class Symbol:
     __sub__, __rsub__ = _arithmetic("fsub", "sub")
     __mul__, __rmul__ = _arithmetic("fmul", "mul")
     __truediv__, __rtruediv__ = _arithmetic("fdiv", None)
-    __lt__, __gt__ = _comparison("<"), _comparison(">")
-    __eq__ = _comparison("==")
+    __mod__, __rmod__ = _arithmetic(None, "srem")
+    __and__, __rand__ = _arithmetic(None, "and_")
+    __or__, __ror__ = _arithmetic(None, "or_")
+    __lshift__, __rlshift__ = _arithmetic(None, "shl")
+    __lt__, __gt__, __le__, __ge__ = (_comparison(sign) for sign in ("<", ">", "<=", ">="))
+    __eq__, __ne__ = _comparison("=="), _comparison("!=")
 
     def __neg__(self):
-        return _emit(self.kind, lambda builder, x: (builder.neg if self.kind is types.int64 else builder.fneg)(x), self)
+        return emit(self.kind, lambda builder, x: (builder.neg if self.kind is types.int64 else builder.fneg)(x), self)
 
     def __getitem__(self, place):
-        return _emit(self.kind.dtype, lambda builder, x, k: builder.load(builder.gep(x, [k])), self, _as(types.int64, place))
+        place = as_kind(types.int64, place)
+        return emit(self.kind.dtype, lambda builder, x, k: builder.load(builder.gep(x, [k])), self, place)
 
     def __setitem__(self, place, value):
-        value = _as(self.kind.dtype, value)
-        _emit(None, lambda builder, x, k, v: builder.store(v, builder.gep(x, [k])), self, _as(types.int64, place), value)
+        place, value = as_kind(types.int64, place), as_kind(self.kind.dtype, value)
+        emit(None, lambda builder, x, k, v: builder.store(v, builder.gep(x, [k])), self, place, value)
 
     def __bool__(self):
         raise TypeError("a traced function cannot branch on a number that is known only when it runs")
 
 
-pack_of_flags = object()
-
-
 def _common(*values):
     """Return the kind that numbers take where they meet."""
     kinds = [v.kind if isinstance(v, Symbol) else (types.int64 if isinstance(v, int) else types.float64) for v in values]
-    return pack if pack in kinds else (types.float64 if types.float64 in kinds else types.int64)
+    return next((kind for kind in (types.boolean, pack, types.float64) if kind in kinds), types.int64)
 
 
-def _as(kind, value):
+def as_kind(kind, value):
     """Return a number as a symbol of a kind."""
     if not isinstance(value, Symbol):
         if kind is pack:
@@ -117,9 +127,10 @@ def _as(kind, value):
     if value.kind is kind:
         return value
     if (value.kind, kind) == (types.int64, types.float64):
-        return _emit(kind, lambda builder, x: builder.sitofp(x, _FLOAT), value)
-    assert kind is pack, (value.kind, kind)
-    return _emit(pack, _spread, _as(types.float64, value))
+        return emit(kind, lambda builder, x: builder.sitofp(x, _FLOAT), value)
+    if kind is not pack:
+        raise TypeError(f"expected a value of kind {kind}, got one of kind {value.kind}")
+    return emit(pack, _spread, as_kind(types.float64, value))
 
 
 def _spread(builder, x):
@@ -128,12 +139,12 @@ def _spread(builder, x):
     return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(_LANE, PACK), [0] * PACK))
 
 
-def _kind(result):
+def kind_of(result):
     """Return the type of what a traced function returns."""
     if result is None:
         return types.none
     if isinstance(result, tuple):
-        return types.BaseTuple.from_types([_kind(x) for x in result])
+        return types.BaseTuple.from_types([kind_of(x) for x in result])
     return _common(result) if not isinstance(result, Symbol) else result.kind
 
 
@@ -150,7 +161,7 @@ def _value(context, builder, kind, result):
     """Return the value of what a traced function returns."""
     kinds = _parts(kind)
     if kinds is None:
-        return context.get_dummy_value() if kind is types.none else _as(kind, result).value
+        return context.get_dummy_value() if kind is types.none else as_kind(kind, result).value
     return context.make_tuple(builder, kind, [_value(context, builder, k, x) for k, x in zip(kinds, result, strict=True)])
 
 
@@ -167,24 +178,24 @@ def _register(key, function, kinds=None):
 
     @cache
     def typed(given):
-        _builders.append(None)
+        traces.builders.append(None)
         try:
-            return signature(_kind(run(None, None, given, [None] * len(given))), *given)
+            return signature(kind_of(run(None, None, given, [None] * len(given))), *given)
         finally:
-            _builders.pop()
+            traces.builders.pop()
 
     @infer_global(function, typing_key=key)
     class _Signature(AbstractTemplate):
         def generic(self, args, kws):
-            given = tuple(types.unliteral(a) for a in args)
+            given = tuple(types.int64 if isinstance(a, types.Integer) else types.unliteral(a) for a in args)
             return typed(given) if kinds is None or given in kinds else None
 
     def lower(context, builder, sig, args):
-        _builders.append(builder)
+        traces.builders.append(builder)
         try:
             return _value(context, builder, sig.return_type, run(context, builder, sig.args, args))
         finally:
-            _builders.pop()
+            traces.builders.pop()
 
     for given in ((types.VarArg(types.Any),),) if kinds is None else kinds:
         lower_builtin(key, *given)(lower)
@@ -206,7 +217,7 @@ def traced(function: Function) -> Function:
 @traced
 def spread(x):
     """Return a pack of four times a number."""
-    return _as(pack, x) if _builders else x
+    return as_kind(pack, x) if traces.builders else x
 
 
 @traced
@@ -220,8 +231,10 @@ def where(flag, x, y):
     """Return x where a flag is set, and y elsewhere."""
     if not isinstance(flag, Symbol):
         return x if flag else y
+    if isinstance(x, tuple):
+        return tuple(where(flag, *both) for both in zip(x, y, strict=True))
     kind = pack if flag.kind is pack_of_flags else _common(x, y)
-    return _emit(kind, lambda builder, *values: builder.select(*values), flag, _as(kind, x), _as(kind, y))
+    return emit(kind, lambda builder, *values: builder.select(*values), flag, as_kind(kind, x), as_kind(kind, y))
 
 
 def _function(name, plain):
@@ -235,7 +248,7 @@ def _function(name, plain):
             kind = ir.FunctionType(value.type, [value.type])
             return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.{vector}f64"), [value])
 
-        return _emit(x.kind, write, x)
+        return emit(x.kind, write, x)
 
     return apply
 
@@ -253,4 +266,4 @@ def part(x, lane):
     def write(builder, value, k):
         return builder.extract_element(value, builder.trunc(k, _LANE))
 
-    return _emit(types.float64, write, x, _as(types.int64, lane))
+    return emit(types.float64, write, x, as_kind(types.int64, lane))
