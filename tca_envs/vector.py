@@ -42,8 +42,8 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         When a lane whose episode has ended starts anew: "NextStep", "SameStep", or "Disabled": by `reset` with the option
         "reset_mask".
     threads : int, optional
-        How many threads share the lanes; by default as many as Numba has. A process that has used several can be forked, but
-        the fork must keep to one; workers started by "spawn" are free to choose.
+        How many threads share the lanes; by default as many as Numba has. A forked process uses one, whatever is asked
+        for. On a machine that is busy with other work one is faster: threads wait for each other.
 
     Raises
     ------

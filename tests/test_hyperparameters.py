@@ -41,7 +41,7 @@ def test_files_are_by_environment_with_what_rl_zoo_needs(path):
 def test_learners_take_them(task, algorithm):
     settings = HYPERPARAMETERS[task][algorithm]
     before = repr(settings)
-    model = train.build(algorithm, settings, argparse.Namespace(seed=0, device="cpu"))
+    model = train.build(algorithm, settings, argparse.Namespace(seed=0, device="cpu", engine="sb3"))
     assert model.gamma == settings.get("gamma", 0.99) and model.n_envs == settings["n_envs"]
     assert repr(settings) == before
 

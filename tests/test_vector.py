@@ -3,6 +3,8 @@
 import copy
 import pickle
 import re
+import subprocess
+import sys
 
 import gymnasium as gym
 import numba
@@ -189,7 +191,7 @@ def plain(info):
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="there is one thread only")
 @pytest.mark.parametrize("name", ["TCAReach-v0", "TCATwistAlign-v0", "TCAPickAndPlace-v0"])
 def test_the_number_of_threads_changes_nothing(name):
-    one, two = (native(name, 13, threads=threads) for threads in (1, 2))
+    one, two = (native(name, 45, threads=threads) for threads in (1, 2))
     assert_same(one.reset(seed=8), two.reset(seed=8))
     for action in actions(one, 2 * EPISODE + 2):
         assert_same(one.step(action), two.step(action))
@@ -447,3 +449,27 @@ def test_gymnasiums_wrappers_take_it():
     np.testing.assert_allclose(info["episode"]["r"], total)
     env.close()
     assert env.unwrapped.closed
+
+
+def test_a_fork_of_a_process_that_used_threads_goes_on_with_one(tmp_path):
+    """OpenMP's threads are not there in a fork: a parallel loop would wait for them for ever."""
+    script = """
+import os, sys
+import gymnasium as gym, numpy as np
+import tca_envs
+env = gym.make_vec("TCAReach-v0", num_envs=64, threads=2)
+env.reset(seed=0)
+actions = np.ones((64, 3), dtype=np.float32)
+env.step(actions)
+child = os.fork()
+expected = env.step(actions)[0]["observation"] if child else None
+if not child:
+    np.save(sys.argv[1], env.step(actions)[0]["observation"])
+    os._exit(0)
+os.waitpid(child, 0)
+assert np.array_equal(np.load(sys.argv[1]), expected)
+"""
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", script, str(tmp_path / "seen.npy")], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr

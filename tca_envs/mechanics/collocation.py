@@ -1,6 +1,7 @@
 """The equilibrium of arms by Gauss collocation of the strain: what Python calls of the compiled `kernels`."""
 
 import gc
+import os
 import threading
 from functools import cache
 from typing import NamedTuple
@@ -89,6 +90,8 @@ Array = NDArray[np.float64]
 
 WORK = 10_000
 """Nodes times Newton iterations of one call; muscles beyond a few to a module count, too."""
+WORTH_SHARING = 32
+"""Lanes from which on threads gain more than it takes to wake them."""
 SHAPE, INERTIA, STEP, GIVEN, JACOBIAN = 0, 1, 2, 3, 4
 """What `linearise` is asked for."""
 
@@ -144,6 +147,12 @@ class Heat(NamedTuple):
 NO_HEAT = Heat(*np.empty((4, 0, 0)))
 
 
+_forked: list[bool] = []
+"""Not empty in a forked process: threads do not survive a fork, and OpenMP would wait for its own for ever."""
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=lambda: _forked.append(True))
+
+
 class _Scratch(threading.local):
     """Packs for the kernels to work on; each thread of Python has its own."""
 
@@ -196,7 +205,7 @@ def solve_lanes(
     """
     arrays = (strain, tension, from_drive, from_load, drive, load, tip, lengths, report, *(NO_HEAT if heat is None else heat))
     steps = budget(model) if model.ladder else 0
-    if threads > 1 and len(strain) > PACK:
+    if threads > 1 and len(strain) >= WORTH_SHARING and not _forked:
         before = get_num_threads()
         set_num_threads(threads)
         _solve_in_parallel(model.f, model.i, addresses().copy(), _scratch.of(model, threads), steps, first, *arrays)

@@ -197,7 +197,7 @@ def solve(
     start = (strain.copy(), tension.copy(), from_drive.copy(), from_load.copy())
     lanes = (strain, tension, from_drive, from_load)
     solve_lanes(arm.model, *lanes, drive, load, tip, lengths, report, 1.0, threads, heat)
-    if not report[:, 0].any() and report[:, 4].max() <= DOUBT:  # all are WARM, which is 0
+    if not (report[:, 0].any() or (report[:, 4] > DOUBT).any()):  # all are WARM, which is 0
         return
     long = (report[:, 0] == SUBSTEPS) | (report[:, 4] > DOUBT)
     for i in np.flatnonzero(long & (report[:, 0] != FAILED)):
