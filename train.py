@@ -293,8 +293,10 @@ def load(path: Path, algorithm: str, settings: dict[str, Any], options: argparse
     """Return a saved model; prints a message and exits with 2 if it is none or was made for other spaces."""
     if not path.exists():
         fail(f"{path}: not there; a run that ended before its first checkpoint has to start again")
+    # Hindsight asks an environment for rewards and is not read without one.
+    hindsight = {"env": environments(settings, options.seed)} if "replay_buffer_class" in settings else {}
     try:
-        model = learner(algorithm, options.engine).load(path, device=options.device)
+        model = learner(algorithm, options.engine).load(path, device=options.device, **hindsight)
     except Exception as error:  # SB3 passes on whatever torch, pickle and zipfile raise
         fail(f"{path}: expected a {algorithm} policy that this version of stable-baselines3 reads ({error})")
     # As many as it was trained with; goals go on, not again.

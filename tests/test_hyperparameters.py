@@ -38,12 +38,16 @@ def test_files_are_by_environment_with_what_rl_zoo_needs(path):
 
 
 @pytest.mark.parametrize(("task", "algorithm"), ENTRIES)
-def test_learners_take_them(task, algorithm):
+def test_learners_take_them_and_what_they_learn_is_read_again(task, algorithm, tmp_path):
     settings = HYPERPARAMETERS[task][algorithm]
     before = repr(settings)
-    model = train.build(algorithm, settings, argparse.Namespace(seed=0, device="cpu", engine="sb3"))
+    options = argparse.Namespace(seed=0, device="cpu", engine="sb3")
+    model = train.build(algorithm, settings, options)
     assert model.gamma == settings.get("gamma", 0.99) and model.n_envs == settings["n_envs"]
     assert repr(settings) == before
+    model.save(tmp_path / "policy.zip")
+    again = train.load(tmp_path / "policy.zip", algorithm, settings, options)
+    assert type(again) is type(model) and again.n_envs == model.n_envs
 
 
 def test_a_linear_schedule_falls_to_zero():
