@@ -26,7 +26,7 @@ BEATEN_BY: list[tuple[str, str, str]] = [("one-degree", "passive muscles ignored
 
 
 def test_there_are_examples():
-    assert len(EXAMPLES) == 4
+    assert len(EXAMPLES) == 6
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
@@ -71,19 +71,26 @@ def test_every_task_has_a_report():
     assert {path.parent.name for path in ROOT.glob("agents/pretrained/*/report.json")} == set(CONTROLLERS)
 
 
-@pytest.mark.parametrize("report", sorted(ROOT.glob("agents/pretrained/*/report.json")), ids=lambda path: path.parent.name)
-def test_results_are_those_of_the_reports(report):
-    described = json.loads(report.read_text())
-    labels = {"random": "random", "scripted": f"scripted `{CONTROLLERS[described['task']].__name__}`"}
-    for name, result in described["held_out"].items():
-        low, high = (f"{100.0 * bound:.1f}" for bound in result["success_interval"])
-        time = result["time_to_success_s"]
-        row = (
-            f"| {labels.get(name, name if name == 'dagger' else name.upper()).replace('dagger', 'DAgger')} "
-            f"| {100.0 * result['success_rate']:.1f} % ({low}-{high} %) | {result['final_distance_mm']:.2f} mm "
-            f"| {'--' if time is None else f'{time:.2f} s'} | {result['energy_J']:.1f} J |"
+def test_results_are_those_of_the_benchmark():
+    tables = re.findall(r"^\|.*\|$", (ROOT / "docs/benchmark/benchmark.md").read_text(), re.M)
+    assert len(tables) == 3 * (2 + 6)  # of each task a header and its line, four learners and what they are compared with
+    shown = {" ".join(line.split()) for line in README.splitlines()}
+    for line in tables:
+        if not set(line) <= set("|-: "):
+            assert " ".join(line.split()) in shown, line
+
+
+@pytest.mark.parametrize("folder", sorted(ROOT.glob("agents/pretrained/*")), ids=lambda path: path.name)
+def test_policies_that_come_along_are_those_of_the_benchmark(folder):
+    described = json.loads((folder / "report.json").read_text())
+    with (ROOT / "docs/benchmark/runs.csv").open(newline="", encoding="utf-8") as file:
+        run = next(
+            row
+            for row in csv.DictReader(file)
+            if (row["task"], row["policy"], int(row["seed"])) == (folder.name, described["algo"], described["seed"])
         )
-        assert row in README, row
+    assert run["default"] == "True"
+    assert int(run["successes"]) == described["held_out"][described["algo"]]["successes"]
 
 
 def test_the_table_of_tolerances_is_that_of_the_study():
