@@ -21,14 +21,14 @@ from tca_envs.study import output
 from tca_envs.study.scenes import IDS
 from tca_envs.study.timing import no_collection
 
-LANES = (1, 4, 16, 64, 256, 1024, 4096)
+LANES = (1, 4, 16, 64, 256, 1024)
 """Environments in a batch."""
-MOST = {"sync": 64, "async": 16}
+MOST = {"sync": 16, "async": 4}
 """In Gymnasium's vectors: beyond, more environments change nothing, and more processes only take memory."""
 THREADS = (1, 2)
-WINDOWS = 5
+WINDOWS = 3
 """Episodes of a batch that are timed; the median counts ..."""
-PATIENCE_S = 20.0
+PATIENCE_S = 8.0
 """... but none is begun after so much time on a batch [s]."""
 DIFFERENT = 64
 """Batches of random actions that take turns, so that drawing them costs nothing."""
