@@ -26,9 +26,9 @@ LANES = (1, 4, 16, 64, 256, 1024)
 MOST = {"sync": 16, "async": 4}
 """In Gymnasium's vectors: beyond, more environments change nothing, and more processes only take memory."""
 THREADS = (1, 2)
-WINDOWS = 3
+WINDOWS = 15
 """Episodes of a batch that are timed; the median counts ..."""
-PATIENCE_S = 8.0
+PATIENCE_S = 5.0
 """... but none is begun after so much time on a batch [s]."""
 DIFFERENT = 64
 """Batches of random actions that take turns, so that drawing them costs nothing."""
