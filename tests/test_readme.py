@@ -80,6 +80,23 @@ def test_results_are_those_of_the_benchmark():
             assert " ".join(line.split()) in shown, line
 
 
+def test_the_table_of_throughput_is_that_of_the_study():
+    with (ROOT / "docs/study/throughput.csv").open(newline="", encoding="utf-8") as file:
+        rates = {
+            (row["task"], row["kind"], row["threads"], row["environments"]): f"{float(row['median_steps_per_s']):,.0f}"
+            for row in csv.DictReader(file)
+        }
+    for label, *key in (
+        ("1024 arms, two threads", "native", "2", "1024"),
+        ("1024 arms, one thread", "native", "1", "1024"),
+        ("64 arms, one thread", "native", "1", "64"),
+        ("16 arms in Gymnasium's own `SyncVectorEnv`", "sync", "1", "16"),
+        ("4 arms in its `AsyncVectorEnv`", "async", "1", "4"),
+        ("one arm, `gym.make`", "single", "1", "1"),
+    ):
+        assert f"| {label} | {' | '.join(rates[task, *key] for task in CONTROLLERS)} |" in README
+
+
 @pytest.mark.parametrize("folder", sorted(ROOT.glob("agents/pretrained/*")), ids=lambda path: path.name)
 def test_policies_that_come_along_are_those_of_the_benchmark(folder):
     described = json.loads((folder / "report.json").read_text())
