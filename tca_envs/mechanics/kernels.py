@@ -79,14 +79,14 @@ REPORT = 5
     MODULES, MUSCLES, NODES, ELEMENTS, WIDE, MOST,
     PIECES, NODES_OF, FIRST_MUSCLE, KIND,
     TOLERANCE, LENGTH, A, B, COUPLING, STIFFNESS, REFERENCE, ROUTE, MASS_BELOW, LAW, REST,
-    STRAIN, TENSION, DRIVE, LOADS, KNOWN_STRAIN, KNOWN_TENSION, KNOWN_DRIVE, KNOWN_LOADS,
+    STRAIN, TENSION, DRIVE, LOADS,
     GOOD_STRAIN, GOOD_TENSION, FROM_DRIVE, FROM_LOADS, TO_DRIVE, TO_LOADS,
     ACTIVE, MOVED, CONVERGED, WORST, TOTAL, INDEX, ROTATED, SHEARED, ITERATIONS, SLOWNESS, OUTCOME,
     RATE, QUATERNION, ENDS, POSITION, ROTATION, TANGENT, FORCE, MOMENT, SPIN, PATH, RESIDUAL, PATHS, GAP, SOFTNESS,
     COMPLIANCE, SLIDE, WRENCH, M_BLOCK, N_BLOCK, X_BLOCK, Y_BLOCK, PULL, SWING,
     MATRIX, PHI, PULLED, BASE, STRETCH, HANDED, BETA, MUSCLE_MATRIX, MUSCLE_PHI, MUSCLE_MOMENT,
     GAMMA, SOURCES, ANSWER, TURNED, BEND, SHEAR, CHANGE, TIP, END,
-) = range(88)  # fmt: skip
+) = range(84)  # fmt: skip
 """Places in `i`. The first six are sizes of the arm: modules M, muscles n, nodes G, elements E, most nodes Q of an element,
 most muscles m of a module. The next four are where its integers begin in `i` itself: M elements, M nodes of an element, M + 1
 first muscles, n kinds. Then, where its numbers begin in `f`, see `collocation.flat`; and, from STRAIN on, where arrays begin
@@ -108,7 +108,7 @@ def layout(modules: int, n: int, nodes: int, elements: int, wide: int, most: int
     g, q, m = nodes, wide, most
     state = (6 * g, n, n, LOAD)
     return (
-        *state, *state,  # what is asked for or found, and what is known
+        *state,  # what is asked for or found
         *state, n, LOAD,  # of `follow`: the last good state, where it began and where it goes
         1, 1, 1, 1, 1, 1, 1, 1, 1, 1, REPORT,  # what kernels tell each other
         4 * q, 4 * g, 4 * (elements + 1), 3 * (elements + 1),  # h o u h/2; quaternions at nodes and ends; positions of ends [m]
