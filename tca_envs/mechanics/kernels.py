@@ -1058,6 +1058,7 @@ def lanes(f, i, a, w, n, first):
                 _store(from_load, LOAD * row, y, i[FROM_LOADS], LOAD, 0)
 
 
+# Numba compiles a function by its own source and keeps it in its cache by its name: so each is written out.
 def _evaluate(f, i, a, w, n, x):
     evaluate(f, i, a, w, n, x)
 
