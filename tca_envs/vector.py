@@ -83,7 +83,6 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._seeds = [-1] * self.num_envs
-        self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._over = np.zeros(self.num_envs, dtype=np.bool_)  # whether the last step ended the episode
         self._ready = False  # whether there has been a reset
 
@@ -146,10 +145,9 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         if anew.size:  # they rest meanwhile, where a step costs next to nothing and cannot fail
             self.core.reset(anew, 0.0, 0.0)
         report = self.task.step(self.core, command)
-        self._elapsed += 1
         truncated = ~solved(report)
         if self.max_episode_steps is not None:
-            truncated |= self._elapsed >= self.max_episode_steps
+            truncated |= self.core.record.steps >= self.max_episode_steps
         if anew.size:
             self._start(anew)
             report[anew] = self.core.rest_report
@@ -239,7 +237,6 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         """Return all episodes, to the last bit: arrays by name and the states of the random generators ("rng")."""
         return {
             **batch.snapshot(self.core.record),
-            "elapsed": self._elapsed.copy(),
             "over": self._over.copy(),
             "rng": [generator.bit_generator.state for generator in self.np_random],
         }
@@ -262,14 +259,13 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
                 f"state['rng'] = {state['rng']!r}: expected the states of {self.num_envs} bit generators"
             ) from None
         batch.restore(self.core.record, state)
-        self._elapsed[:], self._over[:] = state["elapsed"], state["over"]
+        self._over[:] = state["over"]
         self._generators, self._seeds, self._ready = list(generators), [-1] * self.num_envs, True
 
     def _start(self, lanes: Lanes) -> None:
         """Put lanes at rest with new goals."""
         goals, scenes = self.task.draw(self.core, [self._generator(lane) for lane in lanes.tolist()])
         self.core.reset(lanes, goals, scenes)
-        self._elapsed[lanes] = 0
 
     def _generator(self, lane: int) -> np.random.Generator:
         found = self._generators[lane]
