@@ -27,16 +27,25 @@ CIRCLE = 20
 """Sides of a round body."""
 RINGS = 25
 """Cross sections drawn of a module."""
-TURN, FIBRE = 10, 6
+TURN, FIBRE = 8, 5
 """Points of a coil's turn, sides of its fibre."""
 PLATE = 5.6e-3
 """Radius of the plates between which the coils hang [m]: just outside of them."""
 PLATE_THICKNESS = 0.8e-3
 """[m]."""
-BODY, METAL, RING, OBJECT, GOAL, DONE, TABLE = (
-    "#e9e4d8", "#5d6470", "#9fc5d8", "#2f6f4f", "#3cb4ff", "#33c26b", "#f3f3f0",
-)  # fmt: skip
-"""Colours: the soft body, stage and plates, gripper, object, goal, goal that is reached, table."""
+TABLE_HALF = 60e-3
+"""Half an edge of the table [m]."""
+BODY, METAL, RAIL, RING, DEAD, OBJECT, GOAL, TABLE = (
+    "#efe9dc",
+    "#6b7280",
+    "#cfd4da",
+    "#a9cbdc",
+    "#b4b9c1",
+    "#2f7d55",
+    "#2a9df4",
+    "#f4f4f2",
+)
+"""Colours: soft body, stage and plates, column, gripper, dead weight, object, goal, table."""
 
 
 HEAT = np.array(
@@ -157,14 +166,14 @@ def ring_parts(mount: Array, gap: float, temperature: float | None) -> dict[str,
 
 def site_parts(lowered: float) -> dict[str, Part]:
     """Return stage, its column and the table; the stage is `lowered` so far [m]."""
-    edge, deep, thick = 11e-3, 21e-3, 1.5e-3
+    edge, deep, thick = 10e-3, 26e-3, 1.2e-3
     top = presets.SITE.table
     return {
         "stage": box(
             np.array([0.0, 0.5 * (edge - deep), lowered - thick - PLATE_THICKNESS]), (edge, 0.5 * (deep + edge), thick), METAL
         ),
-        "column": box(np.array([0.0, -deep, 0.5 * top - 7e-3]), (3e-3, 3e-3, 0.5 * top + 7e-3), METAL),
-        "table": box(np.array([0.0, 0.0, top + 1e-3]), (60e-3, 60e-3, 1e-3), TABLE),
+        "column": box(np.array([0.0, -deep, 0.5 * top - 7e-3]), (2.5e-3, 2.5e-3, 0.5 * top + 7e-3), RAIL),
+        "table": box(np.array([0.0, 0.0, top + 1e-3]), (TABLE_HALF, TABLE_HALF, 1e-3), TABLE),
     }
 
 
@@ -344,8 +353,8 @@ def _below(task: Task, record: Record) -> dict[str, Part]:
     beyond[:3, 3] += presets.TWISTING_LENGTH * tip[:3, 2]
     line = np.stack([tip[:3, 3], beyond[:3, 3]])
     first, second = (np.broadcast_to(tip[:3, i], (2, 3)) for i in (0, 1))
-    body = sweep(line, first, second, *circle(0.5 * presets.BODY_DIAMETER, CIRCLE), METAL)
-    return {"dead weight": body} | {name: part._replace(colour=METAL) for name, part in ring_parts(beyond, 0.0, None).items()}
+    body = sweep(line, first, second, *circle(0.5 * presets.BODY_DIAMETER, CIRCLE), DEAD)
+    return {"dead weight": body} | {name: part._replace(colour=DEAD) for name, part in ring_parts(beyond, 0.0, None).items()}
 
 
 def _goal(task: Task, record: Record) -> dict[str, Part]:
@@ -370,7 +379,7 @@ def _goal(task: Task, record: Record) -> dict[str, Part]:
             "goal": ball(place, 1e-2 * twist_align.SUCCESS_CM, GOAL, 0.6),
             **{f"goal {name}": part._replace(colour=GOAL, opacity=0.35) for name, part in ghost_ring.items()},
         }
-    return {"goal": ball(place, 1e-2 * reach.SUCCESS_CM, GOAL, 0.6)}
+    return {"goal": ball(place, 1e-2 * reach.SUCCESS_CM, GOAL, 1.0), "goal halo": ball(place, PLATE, GOAL, 0.3)}
 
 
 def heat_colour(temperature: Array | float) -> Array:
