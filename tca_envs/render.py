@@ -134,7 +134,7 @@ class Renderer:
         if self._scene is not None and self._scene.closed:
             return None
         if self._scene is None:
-            self._scene = _Scene(self.size, self.camera, parts, window=self.mode == "human")
+            self._scene = _Scene(self.size, self.camera, parts, self.mode)
         self._scene.show(parts, readout(task, core, lane))
         if self.mode == "human":
             self._due = max(self._due, time.perf_counter()) if self._due else time.perf_counter()
@@ -167,7 +167,8 @@ def readout(task: Task, core: Core, lane: int) -> str:
 class _Scene:
     """A PyVista plotter with an actor for each part; every picture comes with parts of the same names."""
 
-    def __init__(self, size: tuple[int, int], camera: tuple[Array, Array], parts: Mapping[str, Part], window: bool) -> None:
+    def __init__(self, size: tuple[int, int], camera: tuple[Array, Array], parts: Mapping[str, Part], mode: str) -> None:
+        window, annotated = mode == "human", mode != "depth_array"
         pyvista: Any = importlib.import_module("pyvista")  # takes a second, and its types are too narrow for arrays of 32 bits
 
         self.finer = 1 if window else FINER
@@ -191,7 +192,7 @@ class _Scene:
         plotter.add_mesh(self.shadow, color=SHADOW, lighting=False, reset_camera=False)
         for place, strength in LIGHTS:
             plotter.add_light(pyvista.Light(position=MM * np.array(place), focal_point=MM * CENTRE, intensity=strength))
-        self._annotate(pyvista, self.finer * height)
+        self.text = self._annotated(pyvista, self.finer * height) if annotated else None
         plotter.camera.position, plotter.camera.focal_point = MM * camera[0], MM * camera[1]
         plotter.camera.up = (0.0, 0.0, -1.0)
         plotter.camera.view_angle = VIEW_DEG
@@ -208,8 +209,8 @@ class _Scene:
         """Note that the user closed the window; it goes once its events are done."""
         self.closed = True
 
-    def _annotate(self, pyvista: Any, height: int) -> None:
-        """Add colour bar and readout."""
+    def _annotated(self, pyvista: Any, height: int) -> Any:
+        """Add colour bar and readout; returns the latter."""
         size = round(height * 0.026)
         table = pyvista.LookupTable(values=np.hstack([255.0 * geometry.heat_colour(HEAT_SCALE), np.full((256, 1), 255.0)]))
         table.scalar_range = AMBIENT, HARD_LIMIT
@@ -219,10 +220,11 @@ class _Scene:
             "°C", mapper=mapper, vertical=True, n_labels=4, fmt="%.0f", color=INK, title_font_size=size, label_font_size=size,
             width=0.07, height=0.4, position_x=0.9, position_y=0.52, unconstrained_font_size=True,
         )  # fmt: skip
-        self.text = self.plotter.add_text("", position=(0.03 * height, 0.8 * height), font_size=1, color=INK)
-        self.text.prop.font_size = size
-        self.text.prop.SetVerticalJustificationToTop()
-        self.text.SetPosition(0.03 * height, 0.97 * height)
+        text = self.plotter.add_text("", position=(0.0, 0.0), font_size=1, color=INK)
+        text.prop.font_size = size
+        text.prop.SetVerticalJustificationToTop()
+        text.SetPosition(0.03 * height, 0.97 * height)
+        return text
 
     def show(self, parts: Mapping[str, Part], text: str) -> None:
         """Draw parts and a readout."""
@@ -236,7 +238,8 @@ class _Scene:
         np.clip(thrown[:, :2], -MM * geometry.TABLE_HALF, MM * geometry.TABLE_HALF, out=thrown[:, :2])
         thrown[:, 2] = ground
         _write(self.shadow, thrown)
-        self.text.input = text
+        if self.text is not None:
+            self.text.input = text
         self.plotter.renderer.ResetCameraClippingRange()
         self.plotter.render()
 
