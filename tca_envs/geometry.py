@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs import presets
+from tca_envs import batch, presets
 from tca_envs.mechanics import Arm, grasp
 from tca_envs.mechanics.ladder import Lane
 from tca_envs.mechanics.muscle import REFERENCE_LENGTH
@@ -35,19 +35,12 @@ PLATE_THICKNESS = 0.8e-3
 """[m]."""
 TABLE_HALF = 60e-3
 """Half an edge of the table [m]."""
-BODY, METAL, RAIL, RING, DEAD, OBJECT, GOAL, TABLE = (
-    "#efe9dc",
-    "#6b7280",
-    "#cfd4da",
-    "#a9cbdc",
-    "#b4b9c1",
-    "#2f7d55",
-    "#2a9df4",
-    "#f4f4f2",
-)
-"""Colours: soft body, stage and plates, column, gripper, dead weight, object, goal, table."""
-
-
+BODY, RING, OBJECT = "#efe9dc", "#a9cbdc", "#2f7d55"
+"""Colours of soft body, gripper and object ..."""
+GOAL, DONE = "#2a9df4", "#43c97a"
+"""... of a goal, and of one that is reached ..."""
+METAL, RAIL, DEAD, TABLE = "#6b7280", "#cfd4da", "#b4b9c1", "#e9ecef"
+"""... of stage and plates, column, dead weight and table."""
 HEAT = np.array(
     [[13, 8, 135], [76, 2, 161], [126, 3, 168], [170, 35, 149], [204, 71, 120], [230, 108, 92], [248, 149, 64], [253, 197, 39]]
 ) / 255.0  # fmt: skip
@@ -361,13 +354,14 @@ def _goal(task: Task, record: Record) -> dict[str, Part]:
     """Return the goal as a ghost."""
     goal = record.goal[0]
     place = 1e-2 * goal[:3]
+    colour = DONE if batch.outcome(task, task.achieved(record)[0], goal).success else GOAL
     if isinstance(task, pick_and_place.PickAndPlace):
-        ghost = box(place, HALF_OBJECT, GOAL, turn=float(record.scene[0, grasp.YAW]))
+        ghost = box(place, HALF_OBJECT, colour, turn=float(record.scene[0, grasp.YAW]))
         spot = np.eye(4)
         spot[:3, 3] = place[0], place[1], presets.SITE.table - 0.1e-3
         return {
             "goal": ghost._replace(opacity=0.45),
-            "goal place": disc(spot, 1e-2 * pick_and_place.SUCCESS_CM, 0.1e-3, GOAL)._replace(opacity=0.6),
+            "goal place": disc(spot, 1e-2 * pick_and_place.SUCCESS_CM, 0.1e-3, colour)._replace(opacity=0.6),
         }
     if isinstance(task, twist_align.TwistAlign):
         pose = np.eye(4)
@@ -376,10 +370,10 @@ def _goal(task: Task, record: Record) -> dict[str, Part]:
         pose[:3, 3] = place
         ghost_ring = ring_parts(pose, 0.0, None)
         return {
-            "goal": ball(place, 1e-2 * twist_align.SUCCESS_CM, GOAL, 0.6),
-            **{f"goal {name}": part._replace(colour=GOAL, opacity=0.35) for name, part in ghost_ring.items()},
+            "goal": ball(place, 1e-2 * twist_align.SUCCESS_CM, colour, 0.6),
+            **{f"goal {name}": part._replace(colour=colour, opacity=0.35) for name, part in ghost_ring.items()},
         }
-    return {"goal": ball(place, 1e-2 * reach.SUCCESS_CM, GOAL, 1.0), "goal halo": ball(place, PLATE, GOAL, 0.3)}
+    return {"goal": ball(place, 1e-2 * reach.SUCCESS_CM, colour, 1.0), "goal halo": ball(place, PLATE, colour, 0.3)}
 
 
 def heat_colour(temperature: Array | float) -> Array:

@@ -24,17 +24,6 @@ ALL = sorted(name for name, spec in gym.registry.items() if "tca_envs" in str(sp
 SIDE = 160
 
 
-@pytest.fixture(scope="session")
-def drawing():
-    """Skip without PyVista and some OpenGL, which crashes VTK when it is missing; so another process looks."""
-    pytest.importorskip("pyvista", reason='PyVista is missing: pip install -e ".[render]"')
-    code = "import gymnasium, tca_envs; e = gymnasium.make('TCAReach-v0', render_mode='rgb_array'); e.reset(); e.render()"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    if "no OpenGL" in found.stderr:
-        pytest.skip("no OpenGL: neither a display nor EGL nor OSMesa")
-    assert found.returncode == 0 and found.stderr == "", found.stderr
-
-
 def hot(name, steps=12, seed=3, power=(0.8, -1.0, -0.2, 0.4, 0.6, 0.5), **options):
     """Return an environment after some steps."""
     env = gym.make(name, width=SIDE, height=SIDE, **options)
