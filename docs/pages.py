@@ -35,7 +35,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Turn what `pymdownx.arithmatex` marks as LaTeX into MathML, for which browsers need no script; keep short cells in one line."""
+    """Turn what `pymdownx.arithmatex` marks as LaTeX into MathML, which needs no script; keep short cells in one line."""
     html = re.sub(r'<span class="arithmatex">\\\((.*?)\\\)</span>', lambda m: convert(unescape(m[1])), html, flags=re.S)
     html = re.sub(
         r'<div class="arithmatex">\\\[(.*?)\\\]</div>',
@@ -58,11 +58,10 @@ def environment(name: str, picture: str | None) -> str:
     """Return a task's page: its ids and spaces as Gymnasium sees them, and the docstring of its class."""
     task = TASKS[name]
     assert isinstance(task, type)
-    specs = [
-        spec for spec in gymnasium.registry.values() if "tca_envs" in str(spec.entry_point) and spec.kwargs["task"] == name
-    ]
+    specs = [spec for spec in gymnasium.registry.values() if spec.kwargs.get("task") == name]
     env = gymnasium.make(specs[0].id)
-    assert isinstance(env.observation_space, spaces.Dict)
+    boxes = env.observation_space
+    assert isinstance(boxes, spaces.Dict)
     lead, _, rest = (inspect.getdoc(task) or "").partition("\n\n")
     return "\n".join(
         [
@@ -72,10 +71,7 @@ def environment(name: str, picture: str | None) -> str:
             *(f"| `{spec.id}` | {spec.kwargs['reward']} | {spec.max_episode_steps} |" for spec in specs),
             "\n| Space | |\n|---|---|",
             f"| `action_space` | `{env.action_space}` |",
-            *(
-                f'| `observation_space["{key}"]` | `{" ".join(str(box).split())}` |'
-                for key, box in env.observation_space.items()
-            ),
+            *(f'| `observation_space["{key}"]` | `{" ".join(str(box).split())}` |' for key, box in boxes.items()),
             f'\n```python\nimport gymnasium\nimport tca_envs\n\nenv = gymnasium.make("{specs[0].id}")\n```\n',
             rest.replace("degC", "°C"),
         ]
