@@ -7,7 +7,7 @@ that add up to the arm's measured 6 g.
 from collections.abc import Callable
 from functools import cache
 from itertools import product
-from math import pi
+from math import cos, pi, radians
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,6 +43,15 @@ TWISTING_TURNS = 5.0
 """(paper, section IV.B)."""
 TWISTING_MASS = 1.2e-3
 """[kg] (estimate)."""
+
+FIBRE_LENGTH = 144.5e-3
+"""Of the fibre in a 45 mm TCA [m] (as `TCA.untwist_gain`)."""
+COIL_RADIUS = 0.3725e-3
+"""Of the fibre's centerline around the coil's axis [m] (as `TCA.untwist_gain`)."""
+COIL_PITCH_DEG = 18.14
+"""Angle of the fibre against the coil's cross section (as `TCA.untwist_gain`)."""
+FIBRE_DIAMETER = (32.0 / pi * FIBRE_LENGTH * (COIL_RADIUS * cos(radians(COIL_PITCH_DEG))) ** 2 / TCA.compliance_gain) ** 0.25
+"""[m]: C = l r^2 cos^2(alpha)/J with J = pi d^4/32, of which `TCA.compliance_gain` was measured (paper, below eq. (23))."""
 
 GRIPPER_LENGTH = 35e-3
 """Of the ring's centerline [m]: u* = 2 pi/L = 179.5 1/m."""

@@ -1,10 +1,10 @@
 """The arm as data: muscles in modules, modules in series, what hangs from the tip; and its equilibrium."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from math import ceil, hypot
+from math import ceil
 from operator import index as as_integer
 from typing import Any, NamedTuple
 
@@ -283,6 +283,22 @@ def default_grid(module: Module) -> Grid:
     return Grid(max(2, ceil(2.0 * turns), ceil(bend / 2.0)), 5 if turns > 1.0 else 8)
 
 
+class Piece(NamedTuple):
+    """An element of an arm's grid, and which of some arc positions it holds."""
+
+    module: int
+    number: int
+    """Of the element in its module."""
+    node: int
+    """Its first node."""
+    length: float
+    """[m]."""
+    inside: NDArray[np.intp]
+    """Indices of the positions."""
+    fraction: Array
+    """Their places in the element, 0 to 1."""
+
+
 class Arm:
     """Soft modules in series, base at the origin, z along the unloaded arm.
 
@@ -500,6 +516,31 @@ class Arm:
         strain, tension, drive, load = lane
         return linearise(self.model, strain, tension.copy(), drive, load, 0.0, False, SHAPE, strain)[1:7]
 
+    def pieces(self, s: Array) -> Iterator[Piece]:
+        """Yield the elements, base to tip, with those of the arc positions `s` (k,) [m] that they hold."""
+        base, node = 0.0, 0
+        for k, (module, (elements, q)) in enumerate(zip(self.modules, self.grids, strict=True)):
+            h = module.length / elements
+            for number in range(elements):
+                low, high = (base + module.length * (n / elements) for n in (number, number + 1))
+                last = k == len(self.modules) - 1 and number == elements - 1
+                inside = np.flatnonzero((s >= low - 1e-15) & ((s < high - 1e-15) | last))
+                yield Piece(k, number, node, h, inside, (s[inside] - low) / h)
+                node += q
+            base += module.length
+
+    def poses(self, lane: Lane, s: Array) -> Array:
+        """Return the poses (k, 4, 4) of the cross sections of an equilibrium at arc positions `s` (k,) in [0, length] [m]."""
+        ends, quaternion, position, tangent, _, _ = self.shape(lane)
+        turns, places = np.empty((s.size, 4)), np.empty((s.size, 3))
+        for e, piece in enumerate(self.pieces(s)):
+            q = self.grids[piece.module].nodes
+            nodes = slice(piece.node, piece.node + q)
+            a = piece.length * integrals(gauss(q)[2], piece.fraction)
+            turns[piece.inside] = ends[e] + a @ _half_product(quaternion[nodes], lane.strain[nodes, :3])
+            places[piece.inside] = position[e] + a @ tangent[nodes]
+        return pose(turns, places)
+
     def checked_drive(self, drive: ArrayLike) -> Array:
         """Return `drive` as (n,) floats; ValueError for a wrong shape, non-finite numbers or values out of a law's range."""
         result = check.array("drive", drive, (len(self.muscles),))
@@ -558,63 +599,63 @@ class _Shape(NamedTuple):
         """Return poses and strains at `s`: collocation polynomials for pose and moment, section balance for the strain."""
         arm, model = self.arm, self.arm.model
         strain, tension, _, load = self.lane
-        ends, quaternion, position, tangent, spin, _ = arm.shape(self.lane)
+        ends, _, position, _, spin, _ = arm.shape(self.lane)
         rotation = pose(ends[-1], position[-1])[:3, :3]
         force_tip = load[0:3] + load[9] * load[6:9]
         moment = load[3:6] + np.cross(rotation @ load[10:13], load[9] * load[6:9])
-        poses, strains = np.empty((s.size, 4, 4)), np.empty((s.size, 6))
-        start, e, g, mass = arm.length, len(ends) - 1, len(strain), 0.0
-        for k in range(len(arm.modules) - 1, -1, -1):
-            module, (elements, q) = arm.modules[k], arm.grids[k]
+        poses, strains = arm.poses(self.lane, s), np.empty((s.size, 6))
+        mass = 0.0
+        for piece in reversed(list(arm.pieces(s))):
+            module, q = arm.modules[piece.module], arm.grids[piece.module].nodes
             _, b, c = gauss(q)
-            h = module.length / elements
-            muscles = slice(model.first_muscle[k], model.first_muscle[k + 1])
-            base = start - module.length
-            for piece in range(elements - 1, -1, -1):
-                e, g = e - 1, g - q
-                low, high = base + piece * h, base + (piece + 1) * h
-                inside = (s >= low - 1e-15) & ((s < high - 1e-15) | (e == len(ends) - 2))
-                x = (s[inside] - low) / h
-                coefficients = h * integrals(c, x)
-                rate = np.array([_half_product(quaternion[g + j], strain[g + j, :3]) for j in range(q)])
-                for index, a, here in zip(np.flatnonzero(inside), coefficients, x, strict=True):
-                    frame = pose(ends[e] + a @ rate, position[e] + a @ tangent[g : g + q])
-                    r = frame[:3, :3]
-                    below = mass + module.mass_per_length * h * (1.0 - here)
-                    wrench = np.concatenate(
-                        [
-                            r.T @ (moment + (h * b - a) @ spin[g : g + q]),
-                            r.T @ (force_tip + below * load[6:9]),
-                        ]
-                    )
-                    fraction = (piece + here) / elements
-                    route = np.array([module.route(m, fraction) for m in module.muscles]).reshape(-1, 4)
-                    nearest = strain[g + int(np.argmin(np.abs(c - here)))]
-                    poses[index] = frame
-                    strains[index] = section.solve(
-                        module.stiffness,
-                        module.reference_strain,
-                        route,
-                        tension[muscles],
-                        wrench,
-                        nearest,
-                    )
-                moment = moment + h * b @ spin[g : g + q]
-                mass += module.mass_per_length * h
-            start = base
+            muscles = slice(model.first_muscle[piece.module], model.first_muscle[piece.module + 1])
+            nodes = slice(piece.node, piece.node + q)
+            coefficients = piece.length * integrals(c, piece.fraction)
+            for index, a, here in zip(piece.inside, coefficients, piece.fraction, strict=True):
+                r = poses[index, :3, :3]
+                below = mass + module.mass_per_length * piece.length * (1.0 - here)
+                wrench = np.concatenate(
+                    [
+                        r.T @ (moment + (piece.length * b - a) @ spin[nodes]),
+                        r.T @ (force_tip + below * load[6:9]),
+                    ]
+                )
+                fraction = (piece.number + here) / arm.grids[piece.module].elements
+                route = np.array([module.route(m, fraction) for m in module.muscles]).reshape(-1, 4)
+                nearest = strain[piece.node + int(np.argmin(np.abs(c - here)))]
+                strains[index] = section.solve(
+                    module.stiffness,
+                    module.reference_strain,
+                    route,
+                    tension[muscles],
+                    wrench,
+                    nearest,
+                )
+            moment = moment + piece.length * b @ spin[nodes]
+            mass += module.mass_per_length * piece.length
         return poses, strains
 
 
 def pose(quaternion: Array, position: Array) -> Array:
-    """Return the (4, 4) pose of a quaternion (w, x, y, z) of any norm and a position (3,)."""
-    w, x, y, z = quaternion / hypot(*quaternion)
-    result = np.eye(4)
-    result[:3, :3] = (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    """Return the (..., 4, 4) poses of quaternions (..., 4), w x y z, of any norm, and positions (..., 3)."""
+    w, x, y, z = np.moveaxis(quaternion, -1, 0) / np.sqrt(np.sum(quaternion**2, axis=-1))
+    result = np.zeros((*np.shape(w), 4, 4))
+    result[..., 0, 0], result[..., 0, 1], result[..., 0, 2] = (
+        1.0 - 2.0 * (y * y + z * z),
+        2.0 * (x * y - w * z),
+        2.0 * (x * z + w * y),
     )
-    result[:3, 3] = position
+    result[..., 1, 0], result[..., 1, 1], result[..., 1, 2] = (
+        2.0 * (x * y + w * z),
+        1.0 - 2.0 * (x * x + z * z),
+        2.0 * (y * z - w * x),
+    )
+    result[..., 2, 0], result[..., 2, 1], result[..., 2, 2] = (
+        2.0 * (x * z - w * y),
+        2.0 * (y * z + w * x),
+        1.0 - 2.0 * (x * x + y * y),
+    )
+    result[..., :3, 3], result[..., 3, 3] = position, 1.0
     return result
 
 
@@ -625,9 +666,10 @@ def _flat(payload: Payload) -> tuple[float, ...]:
 
 
 def _half_product(q: Array, u: Array) -> Array:
-    """Return (q o [0, u])/2, eq. (28)."""
-    (w, x, y, z), (a, b, c) = q, u
-    return 0.5 * np.array([-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a])
+    """Return (q o [0, u])/2 of (..., 4) and (..., 3), eq. (28)."""
+    (w, x, y, z), (a, b, c) = np.moveaxis(q, -1, 0), np.moveaxis(u, -1, 0)
+    product = [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
+    return 0.5 * np.stack(product, axis=-1)
 
 
 def _checked(grids: Sequence[Grid], modules: int) -> tuple[Grid, ...]:

@@ -38,6 +38,8 @@ class Record:
     """(N, m) heating power of the last step after the cut-off [W]."""
     energy: Array
     """(N,) electrical energy since the episode's start [J]."""
+    steps: NDArray[np.int64]
+    """(N,) since the episode's start."""
     strain: Array
     """(N, G, 6) strain at the arm's nodes: the warm start."""
     tension: Array
@@ -100,7 +102,8 @@ class Core:
         self.threads = 1  # that share the lanes
         self.heating = heater.scaled(np.append(arm.rest_lengths, others))
         self._heating = thermal.constants(STEP_S, CUT_OFF, self.heating)
-        self._load = arm.load()
+        self.load = arm.load()
+        """Gravity, and forces on the tips if any, as `kernels.LOAD` numbers; may be changed between steps."""
         self.rest, self.rest_report = self._rest(goal_size, scene_size)
         self.record = self.rest.rows(np.zeros(lanes, dtype=np.intp))
 
@@ -112,6 +115,7 @@ class Core:
             temperature=ambient,
             power=np.zeros_like(ambient),
             energy=np.zeros(1),
+            steps=np.zeros(1, dtype=np.int64),
             strain=strain,
             tension=tension,
             drive=drive,
@@ -134,7 +138,7 @@ class Core:
         """
         report = np.empty((len(temperature), REPORT))
         load = np.empty((len(temperature), LOAD))
-        load[:] = self._load
+        load[:] = self.load
         load[:, PAYLOAD_MASS:] = record.payload
         ladder.solve(
             self.arm, record.strain, record.tension, record.drive, record.load, temperature, load,
@@ -170,6 +174,7 @@ class Core:
         record = self.record
         power, temperature = np.empty_like(record.power), np.empty_like(record.temperature)
         action = np.ascontiguousarray(action, dtype=np.float64)
+        record.steps += 1
         return self._solve(record, temperature, Heat(action, record.temperature, power, self._heating))
 
     def settle(self, temperature: Array, payload: Array | None = None) -> tuple[Record, NDArray[np.bool_]]:
