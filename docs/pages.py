@@ -3,11 +3,11 @@
 import inspect
 import re
 from html import unescape
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any
 
 import gymnasium
-import ziamath
 from gymnasium import spaces
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File
@@ -18,7 +18,7 @@ from tca_envs.tasks import TASKS
 ROOT = Path(__file__).parents[1]
 OVERVIEW = ("Start", "Use", "Environments", "Cite")
 """Sections of the README that the overview shows after its opening."""
-FONT = Path(ziamath.__file__).parent / "fonts" / "STIXTwoMath-Regular.ttf"
+FONT = Path(str(distribution("ziamath").locate_file("ziamath/fonts/STIXTwoMath-Regular.ttf")))
 """Browsers place scripts and brackets well only with a font that is made for mathematics; site.css names it."""
 PICTURES = (".webp", ".gif", ".png")
 """A task's picture in docs/ has its name and one of these, the first that is there."""
