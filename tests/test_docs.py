@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import os
 import re
 import shutil
 import subprocess
@@ -101,6 +102,26 @@ def test_the_length_of_episodes_is_said(spec):
     task = spec.kwargs["task"]
     assert f"Truncation after {spec.max_episode_steps} steps of 0.1 s" in section(task, "Episode End")
     assert f"`{spec.id}`" in section(task, "Rewards")
+
+
+EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs/seeing.md").read_text(encoding="utf-8"), re.S)
+
+
+@pytest.mark.parametrize(
+    ("example", "says"), list(zip(EXAMPLES, (r"\(480, 640, 3\) uint8", r"0\.1\d+", "True"), strict=True)), ids=range(3)
+)
+@pytest.mark.usefixtures("drawing")
+def test_examples_of_pictures_run(example, says, tmp_path):
+    if "RecordVideo" in example:
+        pytest.importorskip("moviepy", reason='MoviePy is missing: pip install -e ".[video]"')
+    command = [sys.executable, "-W", "error", "-c", example]
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(says, done.stdout.strip())
+    assert "RecordVideo" not in example or list((tmp_path / "runs/videos").glob("*.mp4"))
 
 
 class Page(HTMLParser):
