@@ -99,26 +99,27 @@ def arm_parts(arm: Arm, lane: Lane) -> dict[str, Part]:
 
     A module is drawn with the round section that has its stiffness, EI/EA = radius^2/4.
     """
+    turns = [coil_turns(module.rest_length(m)) for module in arm.modules for m in module.muscles]
+    places, base, number = [], 0.0, 0
+    for module in arm.modules:
+        counts = [RINGS, *(round(TURN * turns[number + i]) + 1 for i in range(len(module.muscles)))]
+        places += [np.minimum(base + module.length * np.linspace(0.0, 1.0, count), arm.length) for count in counts]
+        base, number = base + module.length, number + len(module.muscles)
+    poses = iter(np.split(arm.poses(lane, np.concatenate(places)), np.cumsum([s.size for s in places])[:-1]))
     result: dict[str, Part] = {}
-    base, muscle = 0.0, 0
+    number = 0
     for k, module in enumerate(arm.modules):
-        turns = [coil_turns(module.rest_length(m)) for m in module.muscles]
-        fractions = [np.linspace(0.0, 1.0, RINGS), *(np.linspace(0.0, 1.0, round(TURN * n) + 1) for n in turns)]
-        poses = np.split(
-            arm.poses(lane, np.minimum(base + module.length * np.concatenate(fractions), arm.length)),
-            np.cumsum([f.size for f in fractions])[:-1],
-        )
+        body = next(poses)
         radius = 2.0 * float(np.sqrt(module.stiffness[0] / module.stiffness[5]))
-        body = poses[0]
         result[f"module {k}"] = sweep(body[:, :3, 3], body[:, :3, 0], body[:, :3, 1], *circle(radius, CIRCLE), BODY)
         for end, pose in (("top", body[0]), ("bottom", body[-1])):
             result[f"plate {k} {end}"] = disc(pose, PLATE, PLATE_THICKNESS, METAL)
-        for m, fraction, frames, count in zip(module.muscles, fractions[1:], poses[1:], turns, strict=True):
-            route = module.route(m, fraction)[:, :2]
+        for muscle in module.muscles:
+            frames = next(poses)
+            route = module.route(muscle, np.linspace(0.0, 1.0, len(frames)))[:, :2]
             out = np.einsum("kij,kj->ki", frames[:, :3, :2], route)
-            result[f"coil {muscle}"] = coil(frames[:, :3, 3] + out, out, count, float(lane.drive[muscle]))
-            muscle += 1
-        base += module.length
+            result[f"coil {number}"] = coil(frames[:, :3, 3] + out, out, turns[number], float(lane.drive[number]))
+            number += 1
     return result
 
 
@@ -360,7 +361,7 @@ def _goal(task: Task, record: Record) -> dict[str, Part]:
         spot = np.eye(4)
         spot[:3, 3] = place[0], place[1], presets.SITE.table - 0.1e-3
         return {
-            "goal": ghost._replace(opacity=0.45),
+            "goal": ghost._replace(opacity=0.55),
             "goal place": disc(spot, 1e-2 * pick_and_place.SUCCESS_CM, 0.1e-3, colour)._replace(opacity=0.6),
         }
     if isinstance(task, twist_align.TwistAlign):
@@ -371,9 +372,9 @@ def _goal(task: Task, record: Record) -> dict[str, Part]:
         ghost_ring = ring_parts(pose, 0.0, None)
         return {
             "goal": ball(place, 1e-2 * twist_align.SUCCESS_CM, colour, 0.6),
-            **{f"goal {name}": part._replace(colour=colour, opacity=0.35) for name, part in ghost_ring.items()},
+            **{f"goal {name}": part._replace(colour=colour, opacity=0.5) for name, part in ghost_ring.items()},
         }
-    return {"goal": ball(place, 1e-2 * reach.SUCCESS_CM, colour, 1.0), "goal halo": ball(place, PLATE, colour, 0.3)}
+    return {"goal": ball(place, 1e-2 * reach.SUCCESS_CM, colour, 1.0), "goal halo": ball(place, PLATE, colour, 0.4)}
 
 
 def heat_colour(temperature: Array | float) -> Array:
