@@ -161,9 +161,9 @@ def site_parts(lowered: float) -> dict[str, Part]:
     top = presets.SITE.table
     return {
         "stage": box(
-            np.array([0.0, 0.5 * (deep - edge), lowered - thick - PLATE_THICKNESS]), (edge, 0.5 * (deep + edge), thick), METAL
+            np.array([0.0, 0.5 * (edge - deep), lowered - thick - PLATE_THICKNESS]), (edge, 0.5 * (deep + edge), thick), METAL
         ),
-        "column": box(np.array([0.0, deep, 0.5 * top - 7e-3]), (3e-3, 3e-3, 0.5 * top + 7e-3), METAL),
+        "column": box(np.array([0.0, -deep, 0.5 * top - 7e-3]), (3e-3, 3e-3, 0.5 * top + 7e-3), METAL),
         "table": box(np.array([0.0, 0.0, top + 1e-3]), (60e-3, 60e-3, 1e-3), TABLE),
     }
 
