@@ -38,7 +38,7 @@ PLOT = 178
 """Height of a plot [pixels]: both fit under the readings on a small screen."""
 HOT, TIGHT = (0.0, HARD_LIMIT + 5.0), (-50.0, 300.0)
 """What the plots span [degC], [mN]."""
-FONT = "11px sans-serif"
+FONT, TICKS = "11px sans-serif", uplot.Axis_Ticks(size=4.0)
 RUNGS = {
     Rung.WARM: "Newton from the last step",
     Rung.SUBSTEPS: "Newton in substeps",
@@ -89,7 +89,6 @@ class Page:
     def _build(self) -> None:
         gui = self.client.gui
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False, brand_color=(0, 84, 147))
-        gui.set_panel_label("tca_envs")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL)
         with gui.add_folder("Task"):
@@ -102,23 +101,21 @@ class Page:
         with gui.add_folder("Time"):
             self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
             self._single = gui.add_button("Step by 0.1 s", icon=viser.Icon.PLAYER_TRACK_NEXT, disabled=True)
-        with gui.add_folder("Drive"):
+        with gui.add_folder("Drive") as self._drive:
             there = [name for name, kind in CONTROLLERS.items() if not kind.missing()]
             self._controller = gui.add_dropdown("Driven by", there, initial_value=MANUAL)
             for name, kind in CONTROLLERS.items():
                 if kind.missing():
                     gui.add_markdown(f"*{name}: {kind.missing()}*")
-            self._drive = gui.add_folder(None)
         with gui.add_folder("World"):
             self._gravity = gui.add_slider("Gravity [g]", -MOST_GRAVITY, MOST_GRAVITY, 0.05, 1.0, hint="Negative is upwards.")
             self._tilt = gui.add_slider("Tilt [°]", -90.0, 90.0, 5.0, 0.0, hint="Of gravity, against the vertical.")
             self._payload = gui.add_slider("Payload [g]", 0.0, MOST_PAYLOAD, 0.1, 0.0, hint="Beside what the task hangs there.")
-        self._panel = gui.add_panel()
-        with self._panel.add_tab("Readings"):
+        panel = gui.add_panel()
+        with panel.add_tab("Readings") as self._readings:
             self._numbers = gui.add_html("")
-            self._charts = gui.add_folder(None)
-        self._panel.dock_left()
-        self._panel.set_width(PANEL)
+        panel.dock_left()
+        panel.set_width(PANEL)
 
         def when(event: Callable[[Callable[[Any], None]], Any], asked: Callable[[], None]) -> None:
             event(lambda _: self._asked.put(asked))
@@ -171,6 +168,7 @@ class Page:
     def _show_controls(self) -> None:
         """Show sliders and plots for the session's task, and where it is."""
         gui, session = self.client.gui, self.session
+        gui.set_panel_label(next(name for name, task in TASKS.items() if task == session.task))
         for handle in (*self._sliders, *self._plots):
             handle.remove()
         with self._drive:
@@ -179,7 +177,7 @@ class Page:
                 gui.add_slider(f"{c.label} [{c.unit}]", 0.0, round(c.most, 2), 0.01, 0.0, disabled=disabled)
                 for c in session.controls
             ]
-        with self._charts:
+        with self._readings:
             names = [control.label for control in session.controls]
             times, temperatures, tensions = session.history()
             heat, pull = temperatures.shape[1], tensions.shape[1]
@@ -232,8 +230,8 @@ def chart(
         (uplot.Series(label="time [s]"), *(uplot.Series(label=n, stroke=c, width=2) for n, c in zip(names, LINES, strict=False))),
         scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=interval)},
         axes=(
-            uplot.Axis(label="time [s]", font=FONT, labelFont=FONT, size=24.0, labelSize=18.0),
-            uplot.Axis(label=label, font=FONT, labelFont=FONT, size=38.0, labelSize=18.0),
+            uplot.Axis(label="time [s]", font=FONT, labelFont=FONT, ticks=TICKS, gap=2.0, size=22.0, labelSize=16.0),
+            uplot.Axis(label=label, font=FONT, labelFont=FONT, ticks=TICKS, gap=2.0, size=34.0, labelSize=18.0),
         ),
         legend=uplot.Legend(show=True, live=False),
         height=PLOT,
@@ -242,11 +240,11 @@ def chart(
 
 
 def series(times: Array, values: Array) -> tuple[Array, ...]:
-    """Return times and columns of values for a plot of the last half minute; before the start there is nothing."""
+    """Return times and columns of values for a plot that spans half a minute from the first time; what is to come is blank."""
     missing = round(HISTORY_S / STEP_S) + 1 - len(times)
     return (
-        np.concatenate([times[0] - STEP_S * np.arange(missing, 0, -1), times]),
-        *(np.concatenate([np.full(missing, np.nan), column]) for column in values.T),
+        np.concatenate([times, times[-1] + STEP_S * np.arange(1, missing + 1)]),
+        *(np.concatenate([column, np.full(missing, np.nan)]) for column in values.T),
     )
 
 

@@ -5,7 +5,8 @@ import threading
 
 import viser
 
-from tca_envs.viewer.page import CAMERA, LOOK_AT, VIEW_RAD, Page
+from tca_envs.viewer.page import CAMERA, LOOK_AT, TASKS, VIEW_RAD, Page
+from tca_envs.viewer.session import Session
 
 log = logging.getLogger(__name__)
 
@@ -26,8 +27,13 @@ class Viewer:
         self.server.scene.set_up_direction("-z")
         self.server.initial_camera.position, self.server.initial_camera.look_at = CAMERA, LOOK_AT
         self.server.initial_camera.fov = VIEW_RAD
-        # Beside viser's own light from above, which throws the shadows: one from the front left, or what hangs is dark.
-        self.server.scene.add_light_directional("/front", intensity=1.5, position=(-6.0, -12.0, -4.0))
+        # An environment map takes a browser without a graphics card ten seconds to begin with. What it would light: beside
+        # viser's own lamp above, which throws the shadows, all of it a little, and what hangs from the front left.
+        self.server.scene.configure_environment_map(None)
+        self.server.scene.add_light_ambient("/all", intensity=1.1)
+        self.server.scene.add_light_directional("/front", intensity=1.8, position=(-6.0, -12.0, -4.0))
+        # The first step compiles kernels or reads them from a cache.
+        Session(TASKS["PickAndPlace"]).step()
         self.pages: dict[int, Page] = {}
         """Of the visitors that are there, by viser's number of the client."""
         self.server.on_client_disconnect(self._leave)

@@ -224,7 +224,7 @@ def _controls(env: ArmEnv) -> list[Control]:
     powers = env.core.heating.max_power
     names += ["Grip"] * (powers.size - len(muscles))
     result = [Control(name, "W", float(power)) for name, power in zip(names, powers, strict=True)]
-    return result + [Control("Stage down", "mm", 1e3 * presets.STAGE_TRAVEL)] * (env.task.actions - powers.size)
+    return result + [Control("Stage", "mm", 1e3 * presets.STAGE_TRAVEL)] * (env.task.actions - powers.size)
 
 
 class Kind(NamedTuple):
