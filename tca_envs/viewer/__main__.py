@@ -4,6 +4,7 @@ import argparse
 import socket
 import sys
 import threading
+import warnings
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -22,9 +23,13 @@ def main(arguments: list[str] | None = None) -> int:
         # viser goes on to the next port where one is taken, and never comes back where the address is not this machine's.
         socket.create_server((options.host, options.port)).close()
     except OSError as error:
-        parser.error(f"--host {options.host} --port {options.port}: expected an address and a free port of this machine ({error})")
-    from tca_envs.viewer.server import Viewer
-
+        parser.error(f"--host {options.host} --port {options.port}: expected this machine's address and a free port ({error})")
+    try:
+        from tca_envs.viewer.server import Viewer
+    except ImportError as error:
+        parser.error(str(error))
+    # A visitor who leaves while the arm is drawn is no reason to worry anyone.
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
     viewer = Viewer(options.host, options.port)
     try:
         threading.Event().wait()

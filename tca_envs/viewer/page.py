@@ -1,6 +1,5 @@
 """The page of one visitor: panels, plots and the arm in 3-D, kept up to date by a thread of its own."""
 
-import logging
 import queue
 import threading
 import time
@@ -8,21 +7,25 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import viser
 from numpy.typing import NDArray
-from viser import uplot
+
+try:
+    import viser
+    from viser import uplot
+except ModuleNotFoundError as error:
+    raise ImportError('the viewer needs viser: pip install "tca_envs[viewer]"') from error
 
 from tca_envs.geometry import HEAT, Part, heat_colour
 from tca_envs.mechanics import Rung
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
 from tca_envs.tasks.core import STEP_S
-from tca_envs.viewer.session import CONTROLLERS, HISTORY_S, MANUAL, MOST_GRAVITY, MOST_PAYLOAD, Control, Session, World
+from tca_envs.viewer.session import CONTROLLERS, HISTORY_S, MANUAL, MOST_GRAVITY, MOST_PAYLOAD, MOST_TILT, Session, World
 
 Array = NDArray[np.float64]
 
 SCALE = 100.0
 """The scene is drawn in cm: in metres the arm is smaller than what a browser's shadows and near plane are made for."""
-CAMERA, LOOK_AT, VIEW_RAD = (9.0, -19.0, 1.5), (0.2, 0.0, 4.3), 0.55
+CAMERA, LOOK_AT, VIEW_RAD = (-9.0, 19.0, 1.0), (0.2, 0.0, 4.3), 0.52
 """Where the camera starts and what it looks at [cm], and its vertical field of view [rad]: the arm from top to table."""
 TASKS = {"Reach": "reach", "TwistAlign": "twist-align", "PickAndPlace": "pick-and-place"}
 TOLERANCES = {"1 mm": 1e-3, "0.1 mm": 1e-4, "10 µm": 1e-5, "1 µm": 1e-6, "10 nm": 1e-8}
@@ -47,7 +50,6 @@ RUNGS = {
     Rung.FAILED: "none found: stays as it was",
     Rung.CLOSED_FORM: "closed form",
 }
-log = logging.getLogger(__name__)
 
 
 class Page:
@@ -66,8 +68,7 @@ class Page:
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._left = threading.Event()
         self._meshes: dict[str, tuple[viser.MeshHandle, Part]] = {}
-        self._sliders: list[viser.GuiSliderHandle[float]] = []
-        self._plots: list[viser.GuiUplotHandle] = []
+        self._plots: dict[str, list[viser.GuiUplotHandle]] = {}
         self._build()
 
     def leave(self) -> None:
@@ -94,22 +95,28 @@ class Page:
         with gui.add_folder("Task"):
             self._tasks = gui.add_button_group("Task", tuple(TASKS))
             self._tolerance = gui.add_dropdown(
-                "Tip error", tuple(TOLERANCES), initial_value=FIRST_TOLERANCE, hint="At most; the cheapest grid that keeps to it."
+                "Tip error",
+                tuple(TOLERANCES),
+                initial_value=FIRST_TOLERANCE,
+                hint="At most; the cheapest grid is taken.",
             )
             self._seed = gui.add_number("Seed", 0, min=0, max=MOST_SEED, step=1, hint="Of the episode: its goal, its object.")
             self._reset = gui.add_button("Reset", icon=viser.Icon.REFRESH)
         with gui.add_folder("Time"):
             self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
             self._single = gui.add_button("Step by 0.1 s", icon=viser.Icon.PLAYER_TRACK_NEXT, disabled=True)
-        with gui.add_folder("Drive") as self._drive:
+        with gui.add_folder("Drive"):
             there = [name for name, kind in CONTROLLERS.items() if not kind.missing()]
             self._controller = gui.add_dropdown("Driven by", there, initial_value=MANUAL)
             for name, kind in CONTROLLERS.items():
                 if kind.missing():
                     gui.add_markdown(f"*{name}: {kind.missing()}*")
+            # Those of the other tasks are the first ones of these.
+            controls = Session("pick-and-place").controls
+            self._sliders = [gui.add_slider(f"{c.label} [{c.unit}]", 0.0, round(c.most, 2), 0.01, 0.0) for c in controls]
         with gui.add_folder("World"):
             self._gravity = gui.add_slider("Gravity [g]", -MOST_GRAVITY, MOST_GRAVITY, 0.05, 1.0, hint="Negative is upwards.")
-            self._tilt = gui.add_slider("Tilt [°]", -90.0, 90.0, 5.0, 0.0, hint="Of gravity, against the vertical.")
+            self._tilt = gui.add_slider("Tilt [°]", -MOST_TILT, MOST_TILT, 5.0, 0.0, hint="Of gravity, against the vertical.")
             self._payload = gui.add_slider("Payload [g]", 0.0, MOST_PAYLOAD, 0.1, 0.0, hint="Beside what the task hangs there.")
         panel = gui.add_panel()
         with panel.add_tab("Readings") as self._readings:
@@ -131,9 +138,6 @@ class Page:
     def _begin(self, task: str) -> None:
         """Start over with a task and the tolerance that is chosen."""
         self.session = Session(task, TOLERANCES[self._tolerance.value], self._seed.value)
-        for mesh, _ in self._meshes.values():
-            mesh.remove()
-        self._meshes.clear()
         self._change_controller()
         self._show_controls()
 
@@ -158,7 +162,7 @@ class Page:
         session = self.session
         session.world = World(self._gravity.value, self._tilt.value, self._payload.value)
         if session.controller == MANUAL:
-            session.command[:] = [slider.value for slider in self._sliders]
+            session.command[:] = [slider.value for slider in self._sliders[: len(session.controls)]]
         session.step()
         with self.client.atomic():
             self._draw()
@@ -166,35 +170,38 @@ class Page:
                 self._tell()
 
     def _show_controls(self) -> None:
-        """Show sliders and plots for the session's task, and where it is."""
-        gui, session = self.client.gui, self.session
-        gui.set_panel_label(next(name for name, task in TASKS.items() if task == session.task))
-        for handle in (*self._sliders, *self._plots):
-            handle.remove()
-        with self._drive:
-            disabled = session.controller != MANUAL
-            self._sliders = [
-                gui.add_slider(f"{c.label} [{c.unit}]", 0.0, round(c.most, 2), 0.01, 0.0, disabled=disabled)
-                for c in session.controls
-            ]
-        with self._readings:
-            names = [control.label for control in session.controls]
-            times, temperatures, tensions = session.history()
-            heat, pull = temperatures.shape[1], tensions.shape[1]
-            self._plots = [
-                chart(gui, "temperature [°C]", names[:heat], HOT, times, temperatures),
-                chart(gui, "tension [mN]", names[:pull], TIGHT, times, tensions),
-            ]
+        """Show what belongs to the session's task, and where it is."""
+        # Nothing is removed: a browser that is behind would complain of what came last for it.
+        session = self.session
+        self.client.gui.set_panel_label(next(name for name, task in TASKS.items() if task == session.task))
+        for number, slider in enumerate(self._sliders):
+            slider.visible = number < len(session.controls)
+            slider.value = 0.0  # type: ignore[misc]  # viser has a setter
+        if session.task not in self._plots:
+            self._plots[session.task] = self._new_plots()
+        for task, plots in self._plots.items():
+            for plot in plots:
+                plot.visible = task == session.task
         with self.client.atomic():
             self._draw()
             self._tell()
+
+    def _new_plots(self) -> list[viser.GuiUplotHandle]:
+        """Return plots of temperatures and tensions of the session's TCAs."""
+        names = [control.label for control in self.session.controls]
+        times, temperatures, tensions = self.session.history()
+        with self._readings:
+            return [
+                chart(self.client.gui, "temperature [°C]", names[: temperatures.shape[1]], HOT, times, temperatures),
+                chart(self.client.gui, "tension [mN]", names[: tensions.shape[1]], TIGHT, times, tensions),
+            ]
 
     def _draw(self) -> None:
         """Show the arm as it is."""
         parts = self.session.parts()
         for name, part in parts.items():
             colour = rgb(part)
-            if name not in self._meshes:
+            if name not in self._meshes or len(part.vertices) != len(self._meshes[name][1].vertices):
                 mesh = self.client.scene.add_mesh_simple(
                     f"/{name}", SCALE * part.vertices, part.triangles, color=colour,
                     opacity=None if part.opacity == 1.0 else part.opacity, cast_shadow=part.opacity == 1.0,
@@ -202,7 +209,7 @@ class Page:
             else:
                 mesh, before = self._meshes[name]
                 if not np.array_equal(part.vertices, before.vertices):
-                    mesh.vertices = np.float32(SCALE * part.vertices)
+                    mesh.vertices = (SCALE * part.vertices).astype(np.float32)
                 if colour != rgb(before):
                     mesh.color = colour
             self._meshes[name] = mesh, part
@@ -213,21 +220,22 @@ class Page:
         """Show plots, numbers, and what a policy does."""
         session = self.session
         times, temperatures, tensions = session.history()
-        for plot, values in zip(self._plots, (temperatures, tensions), strict=True):
+        for plot, values in zip(self._plots[session.task], (temperatures, tensions), strict=True):
             plot.data = series(times, values)
         self._numbers.content = readings(session)
         if session.controller != MANUAL:
-            for slider, value in zip(self._sliders, session.command.tolist(), strict=True):
-                slider.value = min(round(value, 2), slider.max)
+            for slider, value in zip(self._sliders, session.command.tolist(), strict=False):
+                slider.value = min(round(value, 2), slider.max)  # type: ignore[misc]  # viser has a setter
 
 
 def chart(
     gui: viser.GuiApi, label: str, names: list[str], interval: tuple[float, float], times: Array, values: Array
 ) -> viser.GuiUplotHandle:
     """Return a plot of values (k, c) over times (k,), a line for each name."""
+    lines = [uplot.Series(label=name, stroke=colour, width=2) for name, colour in zip(names, LINES, strict=False)]
     return gui.add_uplot(
         series(times, values),
-        (uplot.Series(label="time [s]"), *(uplot.Series(label=n, stroke=c, width=2) for n, c in zip(names, LINES, strict=False))),
+        (uplot.Series(label="time [s]"), *lines),
         scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=interval)},
         axes=(
             uplot.Axis(label="time [s]", font=FONT, labelFont=FONT, ticks=TICKS, gap=2.0, size=22.0, labelSize=16.0),
@@ -272,7 +280,7 @@ def readings(session: Session) -> str:
         "residual": f"{solve.residual:.0e}",
         "converged": "yes" if solve.converged else "no",
         "jumped": "yes" if solve.jumped else "no",
-        "stability": f"{solve.stability:.3f}, {'stable' if solve.stability > 0.0 else 'unstable'}",
+        "stability": f"{solve.stability:.3f}, {'stable' if solve.stable else 'unstable'}",
         "grid": session.discretisation(),
         "tip error": f"{1e6 * chosen.error:.2g} µm of {1e6 * chosen.tolerance:g} µm",
     }
@@ -282,7 +290,8 @@ def readings(session: Session) -> str:
         f'<div style="display:flex;justify-content:space-between"><span>{AMBIENT:.0f} °C</span><span>colour of the coils</span>'
         f"<span>{HARD_LIMIT:.0f} °C</span></div>"
     )
-    return f'<div style="font-size:0.8em;line-height:1.3;padding:0.2em 0.8em">{table("Task", task)}{table("Solver", solver)}{bar}</div>'
+    content = table("Task", task) + table("Solver", solver) + bar
+    return f'<div style="font-size:0.8em;line-height:1.3;padding:0.2em 0.8em">{content}</div>'
 
 
 def table(title: str, rows: dict[str, str]) -> str:

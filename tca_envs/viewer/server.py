@@ -3,9 +3,7 @@
 import logging
 import threading
 
-import viser
-
-from tca_envs.viewer.page import CAMERA, LOOK_AT, TASKS, VIEW_RAD, Page
+from tca_envs.viewer.page import CAMERA, LOOK_AT, TASKS, VIEW_RAD, Page, viser
 from tca_envs.viewer.session import Session
 
 log = logging.getLogger(__name__)
@@ -28,10 +26,10 @@ class Viewer:
         self.server.initial_camera.position, self.server.initial_camera.look_at = CAMERA, LOOK_AT
         self.server.initial_camera.fov = VIEW_RAD
         # An environment map takes a browser without a graphics card ten seconds to begin with. What it would light: beside
-        # viser's own lamp above, which throws the shadows, all of it a little, and what hangs from the front left.
+        # viser's own lamp above, which throws the shadows, all of it a little, and what hangs from the front.
         self.server.scene.configure_environment_map(None)
-        self.server.scene.add_light_ambient("/all", intensity=1.1)
-        self.server.scene.add_light_directional("/front", intensity=1.8, position=(-6.0, -12.0, -4.0))
+        self.server.scene.add_light_ambient("/all", intensity=1.3)
+        self.server.scene.add_light_directional("/front", intensity=1.5, position=(6.0, 12.0, -4.0))
         # The first step compiles kernels or reads them from a cache.
         Session(TASKS["PickAndPlace"]).step()
         self.pages: dict[int, Page] = {}

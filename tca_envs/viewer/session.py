@@ -1,4 +1,4 @@
-"""What one visitor plays with: an environment, what drives it, the world around it, and what happened lately. No page is needed."""
+"""What one visitor plays with: an environment, what drives it, the world around it and its last half minute; no page."""
 
 import json
 import time
@@ -19,6 +19,7 @@ from tca_envs.env import ArmEnv
 from tca_envs.geometry import Part, parts
 from tca_envs.mechanics import Rung, check, grasp, ladder
 from tca_envs.mechanics.discretisation import COARSEST, FINEST
+from tca_envs.mechanics.kernels import NEUTRAL
 from tca_envs.tasks.core import STEP_S
 
 Array = NDArray[np.float64]
@@ -27,6 +28,8 @@ HISTORY_S = 30.0
 """So much of the past is kept [s]."""
 MOST_GRAVITY = 1.0
 """[g]: beyond that an upright arm folds."""
+MOST_TILT = 90.0
+"""[deg]."""
 MOST_PAYLOAD = 5.0
 """[g], nearly the arm's own weight."""
 MANUAL, SCRIPTED, PRETRAINED = "manual", "scripted", "pretrained"
@@ -69,7 +72,7 @@ class World:
 
     def __post_init__(self) -> None:
         check.scalar("gravity", self.gravity, -MOST_GRAVITY, MOST_GRAVITY)
-        check.scalar("tilt", self.tilt, -90.0, 90.0)
+        check.scalar("tilt", self.tilt, -MOST_TILT, MOST_TILT)
         check.scalar("payload", self.payload, 0.0, MOST_PAYLOAD)
 
     def acceleration(self, own: Array) -> Array:
@@ -89,7 +92,12 @@ class Solve(NamedTuple):
     converged: bool
     jumped: bool
     stability: float
-    """Of the equilibrium, see `Equilibrium.stability`; positive is stable."""
+    """Of the equilibrium, see `Equilibrium.stability`."""
+
+    @property
+    def stable(self) -> bool:
+        """See `Equilibrium.stable`."""
+        return self.stability > -NEUTRAL
 
 
 class Session:
@@ -178,7 +186,7 @@ class Session:
 
     def history(self) -> tuple[Array, Array, Array]:
         """Return the last half minute: times (k,) [s], temperatures (k, m) [degC], tensions (k, n) [mN]; now is last."""
-        times = self.time + STEP_S * np.arange(1 - len(self._past), 1)
+        times = self.time + STEP_S * np.arange(1.0 - len(self._past), 1.0)
         return times, np.array([t for t, _ in self._past]), 1e3 * np.array([f for _, f in self._past])
 
     def parts(self) -> dict[str, Part]:
@@ -251,7 +259,8 @@ def _pretrained(task: str) -> Policy:
 
     folder = _pretrained_folder() / task
     algorithm = json.loads((folder / "policy.json").read_text())["algo"]
-    return {"ppo": PPO, "sac": SAC, "dagger": DAgger}[algorithm].load(folder / "policy.zip", device="cpu")
+    learner: Any = {"ppo": PPO, "sac": SAC, "dagger": DAgger}[algorithm]
+    return learner.load(folder / "policy.zip", device="cpu")
 
 
 def _pretrained_folder() -> Path:
@@ -261,14 +270,15 @@ def _pretrained_folder() -> Path:
 
 
 def _no_scripts() -> str:
-    return "" if find_spec("agents") else "needs the package `agents`, from a checkout"
+    # Others have packages of that name, too.
+    return "" if find_spec("agents") and find_spec("agents.scripted") else "needs the package `agents` of a checkout"
 
 
 def _no_policies() -> str:
     if _no_scripts():
         return _no_scripts()
     if not _pretrained_folder().is_dir():
-        return "needs the policies in a checkout's agents/pretrained"
+        return "needs agents/pretrained of a checkout"
     return "" if find_spec("stable_baselines3") else 'needs pip install "tca_envs[train]"'
 
 
