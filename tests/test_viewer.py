@@ -307,14 +307,11 @@ def test_a_single_step_is_a_tenth_of_a_second(visitor):
     assert visitor.server.session.time == pytest.approx(began + 0.1)
 
 
-def test_keys_move_the_world(visitor):
+def test_keys_move_the_world_a_button_changes_the_task_and_reset_begins_again(visitor):
     thumb = visitor.slider("Gravity [g]").get_by_role("slider")
     thumb.focus()
     thumb.press("Home")
     visitor.run(lambda: visitor.server.session.core.load[8] == pytest.approx(-9.81))
-
-
-def test_a_button_changes_the_task_and_reset_begins_again(visitor):
     visitor.press("PickAndPlace")
     until(lambda: visitor.server.session.task == "pick-and-place")
     visitor.page.get_by_text("Stage [mm]").wait_for()
@@ -337,8 +334,8 @@ def test_the_scripted_controller_drives_and_its_sliders_show_it(visitor):
 
 
 def test_visitors_do_not_disturb_one_another(browser, viewer, visitor, monkeypatch):
-    visitor.press("Reset")
-    until(lambda: visitor.server.session.time == 0.0)
+    visitor.press("PickAndPlace")
+    until(lambda: visitor.server.session.task == "pick-and-place" and visitor.server.session.time == 0.0)
     other = Visitor(browser, viewer)
     assert other.server.session.task == "reach" and visitor.server.session.task == "pick-and-place"
     other.run(lambda: other.server.session.time > 0.5)

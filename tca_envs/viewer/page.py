@@ -19,7 +19,7 @@ from tca_envs.geometry import HEAT, Part, heat_colour
 from tca_envs.mechanics import Rung
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
 from tca_envs.tasks.core import STEP_S
-from tca_envs.viewer.session import CONTROLLERS, HISTORY_S, MANUAL, MOST_GRAVITY, MOST_PAYLOAD, MOST_TILT, Session, World
+from tca_envs.viewer.session import CONTROLLERS, MANUAL, MOST_GRAVITY, MOST_PAYLOAD, MOST_TILT, Session, World
 
 Array = NDArray[np.float64]
 
@@ -39,6 +39,8 @@ PANEL = 350
 """Width of either panel [pixels]."""
 PLOT = 178
 """Height of a plot [pixels]: both fit under the readings on a small screen."""
+SHORTEST_S = 10.0
+"""A plot spans at least this [s], and at most the session's history."""
 HOT, TIGHT = (0.0, HARD_LIMIT + 5.0), (-50.0, 300.0)
 """What the plots span [degC], [mN]."""
 FONT, TICKS = "11px sans-serif", uplot.Axis_Ticks(size=4.0)
@@ -248,8 +250,8 @@ def chart(
 
 
 def series(times: Array, values: Array) -> tuple[Array, ...]:
-    """Return times and columns of values for a plot that spans half a minute from the first time; what is to come is blank."""
-    missing = round(HISTORY_S / STEP_S) + 1 - len(times)
+    """Return times and columns of values for a plot; what is to come of its shortest span is blank."""
+    missing = max(round(SHORTEST_S / STEP_S) + 1 - len(times), 0)
     return (
         np.concatenate([times, times[-1] + STEP_S * np.arange(1, missing + 1)]),
         *(np.concatenate([column, np.full(missing, np.nan)]) for column in values.T),
