@@ -1,0 +1,304 @@
+"""The page of one visitor: panels, plots and the arm in 3-D, kept up to date by a thread of its own."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+try:
+    import viser
+    from viser import uplot
+except ModuleNotFoundError as error:
+    raise ImportError('the viewer needs viser: pip install "tca_envs[viewer]"') from error
+
+from tca_envs.geometry import HEAT, Part, heat_colour
+from tca_envs.mechanics import Rung
+from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
+from tca_envs.tasks.core import STEP_S
+from tca_envs.viewer.session import CONTROLLERS, MANUAL, MOST_GRAVITY, MOST_PAYLOAD, MOST_TILT, Session, World
+
+Array = NDArray[np.float64]
+
+SCALE = 100.0
+"""The scene is drawn in cm: in metres the arm is smaller than what a browser's shadows and near plane are made for."""
+CAMERA, LOOK_AT, VIEW_RAD = (-9.0, 19.0, 1.0), (0.2, 0.0, 4.3), 0.52
+"""Where the camera starts and what it looks at [cm], and its vertical field of view [rad]: the arm from top to table."""
+TASKS = {"Reach": "reach", "TwistAlign": "twist-align", "PickAndPlace": "pick-and-place"}
+TOLERANCES = {"1 mm": 1e-3, "0.1 mm": 1e-4, "10 µm": 1e-5, "1 µm": 1e-6, "10 nm": 1e-8}
+FIRST_TASK, FIRST_TOLERANCE = "Reach", "10 µm"
+MOST_SEED = 2**31 - 1
+LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#6b6b6b")
+"""Colours of the TCAs in the plots, which colour-blind readers can tell apart (Okabe and Ito, and a grey)."""
+SLOWLY = 2
+"""So many steps pass between two drawings of plots and readings."""
+PANEL = 350
+"""Width of either panel [pixels]."""
+PLOT = 178
+"""Height of a plot [pixels]: both fit under the readings on a small screen."""
+SHORTEST_S = 10.0
+"""A plot spans at least this [s], and at most the session's history."""
+HOT, TIGHT = (0.0, HARD_LIMIT + 5.0), (-50.0, 300.0)
+"""What the plots span [degC], [mN]."""
+FONT, TICKS = "11px sans-serif", uplot.Axis_Ticks(size=4.0)
+RUNGS = {
+    Rung.WARM: "Newton from the last step",
+    Rung.SUBSTEPS: "Newton in substeps",
+    Rung.FINER: "Newton on a finer grid",
+    Rung.DESCENT: "fall down the energy",
+    Rung.FAILED: "none found: stays as it was",
+    Rung.CLOSED_FORM: "closed form",
+}
+
+
+class Page:
+    """What a visitor sees and moves. All of it happens in `run`; what the browser reports is only put down for it.
+
+    Parameters
+    ----------
+    client : viser.ClientHandle
+        The visitor's browser.
+    """
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self.client = client
+        self.session = Session(TASKS[FIRST_TASK], TOLERANCES[FIRST_TOLERANCE])
+        self.running = True
+        self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._left = threading.Event()
+        self._meshes: dict[str, tuple[viser.MeshHandle, Part]] = {}
+        self._plots: dict[str, list[viser.GuiUplotHandle]] = {}
+        self._build()
+
+    def leave(self) -> None:
+        """End `run`: the visitor has gone."""
+        self._left.set()
+        self._asked.put(lambda: None)
+
+    def run(self) -> None:
+        """Keep the page up to date until the visitor leaves."""
+        due = time.monotonic()
+        while not self._left.is_set():
+            try:
+                self._asked.get(timeout=max(due - time.monotonic(), 0.0) if self.running else None)()
+            except queue.Empty:
+                self._step()
+                # After a slow solve time goes on from there: nothing is caught up.
+                due = max(due + STEP_S, time.monotonic())
+
+    def _build(self) -> None:
+        gui = self.client.gui
+        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False, brand_color=(0, 84, 147))
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(PANEL)
+        with gui.add_folder("Task"):
+            self._tasks = gui.add_button_group("Task", tuple(TASKS))
+            self._tolerance = gui.add_dropdown(
+                "Tip error",
+                tuple(TOLERANCES),
+                initial_value=FIRST_TOLERANCE,
+                hint="At most; the cheapest grid is taken.",
+            )
+            self._seed = gui.add_number("Seed", 0, min=0, max=MOST_SEED, step=1, hint="Of the episode: its goal, its object.")
+            self._reset = gui.add_button("Reset", icon=viser.Icon.REFRESH)
+        with gui.add_folder("Time"):
+            self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
+            self._single = gui.add_button("Step by 0.1 s", icon=viser.Icon.PLAYER_TRACK_NEXT, disabled=True)
+        with gui.add_folder("Drive"):
+            there = [name for name, kind in CONTROLLERS.items() if not kind.missing()]
+            self._controller = gui.add_dropdown("Driven by", there, initial_value=MANUAL)
+            for name, kind in CONTROLLERS.items():
+                if kind.missing():
+                    gui.add_markdown(f"*{name}: {kind.missing()}*")
+            # Those of the other tasks are the first ones of these.
+            controls = Session("pick-and-place").controls
+            self._sliders = [gui.add_slider(f"{c.label} [{c.unit}]", 0.0, round(c.most, 2), 0.01, 0.0) for c in controls]
+        with gui.add_folder("World"):
+            self._gravity = gui.add_slider("Gravity [g]", -MOST_GRAVITY, MOST_GRAVITY, 0.05, 1.0, hint="Negative is upwards.")
+            self._tilt = gui.add_slider("Tilt [°]", -MOST_TILT, MOST_TILT, 5.0, 0.0, hint="Of gravity, against the vertical.")
+            self._payload = gui.add_slider("Payload [g]", 0.0, MOST_PAYLOAD, 0.1, 0.0, hint="Beside what the task hangs there.")
+        panel = gui.add_panel()
+        with panel.add_tab("Readings") as self._readings:
+            self._numbers = gui.add_html("")
+        panel.dock_left()
+        panel.set_width(PANEL)
+
+        def when(event: Callable[[Callable[[Any], None]], Any], asked: Callable[[], None]) -> None:
+            event(lambda _: self._asked.put(asked))
+
+        when(self._tasks.on_click, lambda: self._begin(TASKS[self._tasks.value]))
+        when(self._tolerance.on_update, lambda: self._begin(self.session.task))
+        when(self._reset.on_click, self._reset_episode)
+        when(self._pause.on_click, self._pause_or_run)
+        when(self._single.on_click, self._step)
+        when(self._controller.on_update, self._change_controller)
+        self._show_controls()
+
+    def _begin(self, task: str) -> None:
+        """Start over with a task and the tolerance that is chosen."""
+        self.session = Session(task, TOLERANCES[self._tolerance.value], self._seed.value)
+        self._change_controller()
+        self._show_controls()
+
+    def _reset_episode(self) -> None:
+        self.session.reset(self._seed.value)
+        self._show_controls()
+
+    def _pause_or_run(self) -> None:
+        self.running = not self.running
+        self._pause.label = "Pause" if self.running else "Run"
+        self._pause.icon = viser.Icon.PLAYER_PAUSE if self.running else viser.Icon.PLAYER_PLAY
+        self._single.disabled = self.running
+
+    def _change_controller(self) -> None:
+        self._controller.disabled = True  # the first policy takes seconds to load
+        self.session.drive_by(self._controller.value)
+        self._controller.disabled = False
+        for slider in self._sliders:
+            slider.disabled = self.session.controller != MANUAL
+
+    def _step(self) -> None:
+        session = self.session
+        session.world = World(self._gravity.value, self._tilt.value, self._payload.value)
+        if session.controller == MANUAL:
+            session.command[:] = [slider.value for slider in self._sliders[: len(session.controls)]]
+        session.step()
+        with self.client.atomic():
+            self._draw()
+            if session.core.record.steps[0] % SLOWLY == 0 or not self.running:
+                self._tell()
+
+    def _show_controls(self) -> None:
+        """Show what belongs to the session's task, and where it is."""
+        # Nothing is removed: a browser that is behind would complain of what came last for it.
+        session = self.session
+        self.client.gui.set_panel_label(next(name for name, task in TASKS.items() if task == session.task))
+        for number, slider in enumerate(self._sliders):
+            slider.visible = number < len(session.controls)
+            slider.value = 0.0  # type: ignore[misc]  # viser has a setter
+        if session.task not in self._plots:
+            self._plots[session.task] = self._new_plots()
+        for task, plots in self._plots.items():
+            for plot in plots:
+                plot.visible = task == session.task
+        with self.client.atomic():
+            self._draw()
+            self._tell()
+
+    def _new_plots(self) -> list[viser.GuiUplotHandle]:
+        """Return plots of temperatures and tensions of the session's TCAs."""
+        names = [control.label for control in self.session.controls]
+        times, temperatures, tensions = self.session.history()
+        with self._readings:
+            return [
+                chart(self.client.gui, "temperature [°C]", names[: temperatures.shape[1]], HOT, times, temperatures),
+                chart(self.client.gui, "tension [mN]", names[: tensions.shape[1]], TIGHT, times, tensions),
+            ]
+
+    def _draw(self) -> None:
+        """Show the arm as it is."""
+        parts = self.session.parts()
+        for name, part in parts.items():
+            colour = rgb(part)
+            if name not in self._meshes or len(part.vertices) != len(self._meshes[name][1].vertices):
+                mesh = self.client.scene.add_mesh_simple(
+                    f"/{name}", SCALE * part.vertices, part.triangles, color=colour,
+                    opacity=None if part.opacity == 1.0 else part.opacity, cast_shadow=part.opacity == 1.0,
+                )  # fmt: skip
+            else:
+                mesh, before = self._meshes[name]
+                if not np.array_equal(part.vertices, before.vertices):
+                    mesh.vertices = (SCALE * part.vertices).astype(np.float32)
+                if colour != rgb(before):
+                    mesh.color = colour
+            self._meshes[name] = mesh, part
+        for name in self._meshes.keys() - parts.keys():
+            self._meshes.pop(name)[0].remove()
+
+    def _tell(self) -> None:
+        """Show plots, numbers, and what a policy does."""
+        session = self.session
+        times, temperatures, tensions = session.history()
+        for plot, values in zip(self._plots[session.task], (temperatures, tensions), strict=True):
+            plot.data = series(times, values)
+        self._numbers.content = readings(session)
+        if session.controller != MANUAL:
+            for slider, value in zip(self._sliders, session.command.tolist(), strict=False):
+                slider.value = min(round(value, 2), slider.max)  # type: ignore[misc]  # viser has a setter
+
+
+def chart(
+    gui: viser.GuiApi, label: str, names: list[str], interval: tuple[float, float], times: Array, values: Array
+) -> viser.GuiUplotHandle:
+    """Return a plot of values (k, c) over times (k,), a line for each name."""
+    lines = [uplot.Series(label=name, stroke=colour, width=2) for name, colour in zip(names, LINES, strict=False)]
+    return gui.add_uplot(
+        series(times, values),
+        (uplot.Series(label="time [s]"), *lines),
+        scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=interval)},
+        axes=(
+            uplot.Axis(label="time [s]", font=FONT, labelFont=FONT, ticks=TICKS, gap=2.0, size=22.0, labelSize=16.0),
+            uplot.Axis(label=label, font=FONT, labelFont=FONT, ticks=TICKS, gap=2.0, size=34.0, labelSize=18.0),
+        ),
+        legend=uplot.Legend(show=True, live=False),
+        height=PLOT,
+        padding=(6, 8, 0, 0),
+    )
+
+
+def series(times: Array, values: Array) -> tuple[Array, ...]:
+    """Return times and columns of values for a plot; what is to come of its shortest span is blank."""
+    missing = max(round(SHORTEST_S / STEP_S) + 1 - len(times), 0)
+    return (
+        np.concatenate([times, times[-1] + STEP_S * np.arange(1, missing + 1)]),
+        *(np.concatenate([column, np.full(missing, np.nan)]) for column in values.T),
+    )
+
+
+def rgb(part: Part) -> tuple[int, int, int]:
+    """Return a part's colour, 0 to 255: of its temperature where it has one."""
+    if part.temperature is None:
+        red, green, blue = bytes.fromhex(part.colour[1:])
+    else:
+        red, green, blue = np.rint(255.0 * heat_colour(part.temperature)).astype(int).tolist()
+    return red, green, blue
+
+
+def readings(session: Session) -> str:
+    """Return HTML with the task's and the solver's numbers, and the colours of temperatures."""
+    info, solve, chosen = session.info, session.solve, session.env.arm.discretisation
+    assert chosen.tolerance is not None and chosen.error is not None
+    task = {"time": f"{session.time:.1f} s", "distance": f"{info['distance_mm']:.2f} mm"}
+    if "yaw_error_deg" in info:
+        task["yaw error"] = f"{info['yaw_error_deg']:.1f}°"
+    task |= {"success": "yes" if info["is_success"] else "no", "energy": f"{info['energy_J']:.1f} J"}
+    solver = {
+        "step took": f"{solve.milliseconds:.2f} ms",
+        "rung": f"{solve.rung.name}: {RUNGS[solve.rung]}",
+        "iterations": f"{solve.iterations}",
+        "residual": f"{solve.residual:.0e}",
+        "converged": "yes" if solve.converged else "no",
+        "jumped": "yes" if solve.jumped else "no",
+        "stability": f"{solve.stability:.3f}, {'stable' if solve.stable else 'unstable'}",
+        "grid": session.discretisation(),
+        "tip error": f"{1e6 * chosen.error:.2g} µm of {1e6 * chosen.tolerance:g} µm",
+    }
+    stops = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255.0 * HEAT)
+    bar = (
+        f'<div style="height:0.6em;border-radius:2px;background:linear-gradient(to right, {stops})"></div>'
+        f'<div style="display:flex;justify-content:space-between"><span>{AMBIENT:.0f} °C</span><span>colour of the coils</span>'
+        f"<span>{HARD_LIMIT:.0f} °C</span></div>"
+    )
+    content = table("Task", task) + table("Solver", solver) + bar
+    return f'<div style="font-size:0.8em;line-height:1.3;padding:0.2em 0.8em">{content}</div>'
+
+
+def table(title: str, rows: dict[str, str]) -> str:
+    """Return an HTML table of names and values."""
+    cells = "".join(
+        f'<tr><td style="color:#666;width:6.5em">{n}</td><td data-reading="{n}">{v}</td></tr>' for n, v in rows.items()
+    )
+    return f'<b>{title}</b><table style="width:100%;margin-bottom:0.5em;font-variant-numeric:tabular-nums">{cells}</table>'
