@@ -33,7 +33,7 @@ CAMERAS: Mapping[str, tuple[Point, Point]] = {
     "front": ((70e-3, 270e-3, 10e-3), (0.0, 0.0, 41e-3)),
     "side": ((270e-3, 60e-3, 10e-3), (0.0, 0.0, 39e-3)),
     "above": ((90e-3, 240e-3, -70e-3), (0.0, 0.0, 43e-3)),
-    "gripper": ((40e-3, 110e-3, 50e-3), (0.0, 0.0, 70e-3)),
+    "gripper": ((50e-3, 165e-3, 40e-3), (0.0, 0.0, 65e-3)),
 }
 """Where cameras stand and at what they look [m] in the base frame with the stage up, z down."""
 MOST_PIXELS = 4096
@@ -114,7 +114,7 @@ class Renderer:
         self.size = (width, height)
         self.camera = camera
         self._scene: _Scene | None = None
-        self._due = 0.0  # when the next frame is to be shown
+        self._due = 0.0  # when the frame that is shown has been for long enough, in the time of `time.perf_counter`
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_scene": None}
@@ -130,14 +130,14 @@ class Renderer:
         RuntimeError
             If there is no OpenGL, or no display for a window.
         """
-        parts = geometry.parts(task, core, lane)
         if self._scene is not None and self._scene.closed:
             return None
+        parts = geometry.parts(task, core, lane)
         if self._scene is None:
             self._scene = _Scene(self.size, self.camera, parts, self.mode)
         self._scene.show(parts, readout(task, core, lane))
         if self.mode == "human":
-            self._due = max(self._due, time.perf_counter()) if self._due else time.perf_counter()
+            self._due = max(self._due, time.perf_counter())
             self._scene.wait(self._due)
             self._due += 1.0 / FPS
             return None
@@ -170,7 +170,6 @@ class _Scene:
     def __init__(self, size: tuple[int, int], camera: tuple[Array, Array], parts: Mapping[str, Part], mode: str) -> None:
         window, annotated = mode == "human", mode != "depth_array"
         pyvista: Any = importlib.import_module("pyvista")  # takes a second, and its types are too narrow for arrays of 32 bits
-
         width, height = size if window else (FINER * size[0], FINER * size[1])
         self.plotter = plotter = _plotter(pyvista, (width, height), window)
         self.meshes, self.actors = {}, {}
@@ -182,8 +181,9 @@ class _Scene:
             self.meshes[name] = mesh
             self.actors[name] = plotter.add_mesh(
                 mesh, color=part.colour, opacity=part.opacity, ambient=light, diffuse=0.7, specular=shine, specular_power=25.0,
-                culling="back", smooth_shading=False, reset_camera=False,
+                culling="back", reset_camera=False,
             )  # fmt: skip
+            self.actors[name].prop.interpolation = "phong"  # by the part's own normals
         self.casters = [name for name, part in parts.items() if name not in SHADOWLESS and part.opacity == 1.0]
         first = np.cumsum([0] + [len(parts[name].vertices) for name in self.casters])
         triangles = np.concatenate([parts[name].triangles + n for name, n in zip(self.casters, first[:-1], strict=True)])
@@ -285,7 +285,7 @@ def _plotter(pyvista: Any, size: tuple[int, int], window: bool) -> Any:
     verbosity = vtkLogger.GetCurrentVerbosityCutoff()
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     try:
-        plotter = pyvista.Plotter(off_screen=not window, window_size=size, lighting="none", title="tca_envs")
+        plotter = pyvista.Plotter(off_screen=not window, window_size=size, lighting="none", title="tca_envs", notebook=False)
         kind = plotter.render_window.GetClassName()
         if window and kind in ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"):
             raise RuntimeError(

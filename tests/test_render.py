@@ -442,6 +442,7 @@ def test_without_opengl_it_is_said_what_to_install(drawing):
 
 WINDOW = """
 import time, subprocess, gymnasium, numpy as np, tca_envs
+from gymnasium.utils.env_checker import check_env
 env = gymnasium.make("TCAReach-v0", render_mode="human", width=200, height=200)
 env.reset(seed=0)
 scene = env.unwrapped._renderer._scene
@@ -461,6 +462,8 @@ for _ in range(3):
     env.step(np.ones(3, dtype=np.float32))
 print("closed", scene.closed)
 env.close()
+check_env(gymnasium.make("TCAReach-v0", render_mode="rgb_array").unwrapped)  # opens a window, too
+print("checked True")
 """
 
 
@@ -488,4 +491,5 @@ def test_a_window_shows_steps_in_real_time_and_turns_with_the_mouse(display):
     assert said["kind"] == "vtkXOpenGLRenderWindow (200, 200)"
     assert 0.95 <= float(said["seconds"]) < 10.0
     assert float(said["turned"]) > 10.0
-    assert said["closed"] == "True"
+    assert said["closed"] == said["checked"] == "True"
+    assert found.stderr == ""
