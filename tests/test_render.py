@@ -278,12 +278,34 @@ def test_pictures_of_two_states_differ_where_they_should(name, drawing):
 
 def test_a_hot_coil_has_the_colour_of_its_temperature(drawing):
     env = hot("TCAReach-v0", render_mode="rgb_array", power=(1.0, -1.0, -1.0), camera=((0.2, 0.15, 0.02), (0.0, 0.0, 0.03)))
-    picture = env.render().astype(float)
-    warmest = picture[..., 0] - picture[..., 2]
-    assert warmest.max() > 100.0
+    middle = slice(60, 100), slice(60, 100)  # without the colour bar
+
+    def warmth():
+        picture = env.render()[middle].astype(float)
+        return (picture[..., 0] - picture[..., 2]).max()
+
+    assert warmth() > 100.0
     env.unwrapped.core.record.drive[0, 0] = 25.0  # as if it were cold
-    assert (env.render().astype(float)[..., 0] - env.render().astype(float)[..., 2])[60:100, 60:100].max() < 60.0
+    assert warmth() < 60.0
     env.close()
+
+
+def test_the_arm_casts_a_shadow_on_the_table_before_a_white_wall(drawing):
+    env = hot("TCATwistAlign-v0", render_mode="rgb_array")
+    picture, shown = env.render().astype(float).mean(axis=2), parts(env)
+    fallen = shown["ring 1"].axis + (presets.SITE.table - shown["ring 1"].axis[:, 2:]) * render.SUN
+    column, row, _ = np.rint(pixels(fallen)).astype(int).T
+    beside = picture[row, column + 25]
+    assert np.all(picture[row, column] < beside - 25.0) and np.ptp(beside) < 15.0
+    assert (picture[:5, -20:] == 255.0).all()
+    env.close()
+
+
+def test_a_goal_that_is_reached_turns_green():
+    env = hot("TCAReach-v0", steps=2)
+    assert parts(env)["goal"].colour == geometry.GOAL
+    env.unwrapped.core.record.goal[0] = env.unwrapped.task.achieved(env.unwrapped.core.record)[0]
+    assert parts(env)["goal"].colour == geometry.DONE
 
 
 def test_the_readout_tells_time_heat_goal_and_success():
