@@ -4,6 +4,7 @@ python train.py [--task reach] [--algo sac] [--steps N] [--seed S]      train an
 python train.py --resume runs/reach-sac-seed0                           go on with a run
 python train.py --eval-only runs/reach-sac-seed0                        evaluate a run
 python train.py --eval-only pretrained [--task reach]                   evaluate the policy that comes along
+python train.py --eval-only pretrained --video out.mp4                  and film it
 python train.py --tune 30 [--task reach] [--algo ppo]                   search for better settings
 python train.py --engine ray [--workers 2] [--seeds 0 1 2]              train PPO by Ray RLlib on several cores or machines
 python train.py --benchmark [--seeds 0 1 2] [--jobs 2]                  all algorithms on all tasks: table and learning curves
@@ -37,6 +38,7 @@ ARTEFACTS = (
     "events.out.tfevents.*",
 )  # fmt: skip
 """What a run leaves in its folder, as patterns."""
+FILMED_EPISODES = 3
 CURVE_SEED = 2_000_000
 """Goals of the learning curve, of the training split, are drawn with seeds from here on."""
 CURVE_EPISODES = 30
@@ -135,7 +137,19 @@ def run(options: argparse.Namespace) -> int:
     path = folder / ("evaluation.json" if options.eval_only else "report.json")
     path.write_text(json.dumps(report, indent=2) + "\n")
     print(f"wrote {path}")
+    if options.video:
+        film(model, settings, options.video)
     return 0
+
+
+def film(policy: Policy, settings: dict[str, Any], path: Path) -> None:
+    """Write a video of the first held-out episodes."""
+    from agents.video import frames, save
+
+    env = gymnasium.make(settings["env"], split="held-out", render_mode="rgb_array")
+    save(frames(policy, env, FILMED_EPISODES, EVALUATION_SEED), path, env.metadata["render_fps"])
+    env.close()
+    print(f"wrote {path}")
 
 
 def run_name(task: str, algorithm: str, engine: str, seed: int) -> str:
@@ -198,6 +212,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=1, help="runs of the benchmark at a time (default: 1)")
     parser.add_argument("--quick", action="store_true", help="a hundredth of the benchmark, to see whether it works")
     parser.add_argument("--episodes", type=int, default=200, help="held-out episodes to evaluate (default: 200)")
+    parser.add_argument(
+        "--video",
+        type=Path,
+        metavar="FILE",
+        help=f"film {FILMED_EPISODES} held-out episodes of the policy: .mp4, .webp or .gif",
+    )
     parser.add_argument("--threads", type=int, default=1, help="threads of torch (default: 1: the networks are small)")
     parser.add_argument("--device", default="cpu", help="torch device (default: cpu)")
     parser.add_argument("--engine", default="sb3", help="sb3 (in one process) or ray (ppo with workers) (default: sb3)")
@@ -221,7 +241,18 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     for name, value in (("seed", options.seed), *(("seeds", value) for value in options.seeds or [])):
         if value < 0:
             fail(f"--{name} {value}: expected an integer of at least 0")
+    if options.video:
+        from agents.video import check_path
+
+        try:
+            check_path(options.video)
+        except ValueError as error:
+            fail(f"--video {options.video}: {error}")
+        except ModuleNotFoundError as error:
+            fail(f"--video needs PyVista and MoviePy: pip install -e '.[train,video]' ({error})")
     chosen = [name for name in ("eval_only", "resume", "tune", "benchmark") if getattr(options, name)]
+    if options.video and (options.tune or options.benchmark or options.seeds):
+        fail("--video is for one policy, not with --tune, --benchmark or --seeds")
     if len(chosen) > 1:
         fail(f"{' and '.join('--' + name.replace('_', '-') for name in chosen)} exclude each other")
     return options

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs import batch, presets
+from tca_envs import batch, presets, render
 from tca_envs.mechanics import Arm
 from tca_envs.tasks.core import solved
 
@@ -25,18 +25,38 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
     tolerance : float
         Largest error of the arm's tip [m], 1e-9 to 1e-3. The cheapest discretisation that keeps to it over the task's states
         is chosen; `env.unwrapped.arm.discretisation` prints it.
+    render_mode : str, optional
+        "rgb_array" or "depth_array": `render` returns pictures; "human": a window shows every step in real time.
+    width, height : int
+        Of pictures or the window [pixel].
+    camera : str or pair of (3,) arrays
+        "front", "side", "above" or "gripper", or where it stands and at what it looks [m] in the base frame, z down.
 
     Raises
     ------
     ValueError
         If an argument is none of these.
+    gymnasium.error.DependencyNotInstalled
+        If a render mode is asked for and PyVista is missing.
     """
 
+    metadata: dict[str, Any] = {"render_modes": list(render.MODES), "render_fps": render.FPS}  # noqa: RUF012  # as Gymnasium
+
     def __init__(
-        self, task: str = "reach", reward: str = "sparse", split: str = "train", tolerance: float = presets.TOLERANCE
+        self,
+        task: str = "reach",
+        reward: str = "sparse",
+        split: str = "train",
+        tolerance: float = presets.TOLERANCE,
+        render_mode: str | None = None,
+        width: int = render.SIZE,
+        height: int = render.SIZE,
+        camera: render.Camera = "front",
     ) -> None:
         self.task = batch.new_task(task, reward, split, tolerance)
-        self.metadata = {"render_modes": []}
+        self._renderer = render.new_renderer(render_mode, width, height, camera)
+        self.render_mode = render_mode
+        self.metadata = {"render_modes": list(render.MODES), "render_fps": render.FPS}
         self.reward = reward
         self.core = self.task.core(1)
         self.action_space = batch.action_space(self.task)
@@ -50,6 +70,8 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         goals, scenes = self.task.draw(self.core, [self.np_random])
         self.core.reset(np.zeros(1, dtype=np.intp), goals, scenes)
         observation, _, info = self._told(self.core.rest_report)
+        if self.render_mode == "human":
+            self.render()
         return observation, info
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, NDArray[Any]], float, bool, bool, dict[str, Any]]:
@@ -63,6 +85,8 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         command = batch.checked_actions("action", action, (self.task.actions,))
         report = self.task.step(self.core, command[np.newaxis])
         observation, reward, info = self._told(report)
+        if self.render_mode == "human":
+            self.render()
         return observation, reward, False, not solved(report[0]), info
 
     def _told(self, report: NDArray[np.float64]) -> tuple[dict[str, NDArray[Any]], float, dict[str, Any]]:
@@ -70,6 +94,23 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         observation, outcome, info = batch.look(self.task, self.core, report)
         reward = batch.rewards(self.reward, outcome)
         return {key: values[0] for key, values in observation.items()}, reward.item(0), batch.of_lane(info, 0)
+
+    def render(self) -> Any:
+        """Return the picture (height, width, 3) uint8, or the distances (height, width) float32 [m] from the camera's plane.
+
+        None with "human", and without a render mode, see `gymnasium.Env.render`; `tca_envs.render` says what a picture shows.
+
+        Raises
+        ------
+        RuntimeError
+            If there is no OpenGL, or no display for a window.
+        """
+        return None if self._renderer is None else self._renderer.render(self.task, self.core)
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._renderer is not None:
+            self._renderer.close()
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
         """Return the reward of a goal (k,) as a float, or of a batch (..., k) as an array (...,); `info` is not read."""

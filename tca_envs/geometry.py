@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs import presets
+from tca_envs import batch, presets
 from tca_envs.mechanics import Arm, grasp
 from tca_envs.mechanics.ladder import Lane
 from tca_envs.mechanics.muscle import REFERENCE_LENGTH
@@ -27,18 +27,20 @@ CIRCLE = 20
 """Sides of a round body."""
 RINGS = 25
 """Cross sections drawn of a module."""
-TURN, FIBRE = 10, 6
+TURN, FIBRE = 8, 5
 """Points of a coil's turn, sides of its fibre."""
 PLATE = 5.6e-3
 """Radius of the plates between which the coils hang [m]: just outside of them."""
 PLATE_THICKNESS = 0.8e-3
 """[m]."""
-BODY, METAL, RING, OBJECT, GOAL, DONE, TABLE = (
-    "#e9e4d8", "#5d6470", "#9fc5d8", "#2f6f4f", "#3cb4ff", "#33c26b", "#f3f3f0",
-)  # fmt: skip
-"""Colours: the soft body, stage and plates, gripper, object, goal, goal that is reached, table."""
-
-
+TABLE_HALF = 60e-3
+"""Half an edge of the table [m]."""
+BODY, RING, OBJECT = "#efe9dc", "#a9cbdc", "#2f7d55"
+"""Colours of soft body, gripper and object ..."""
+GOAL, DONE = "#2a9df4", "#43c97a"
+"""... of a goal, and of one that is reached ..."""
+METAL, RAIL, DEAD, TABLE = "#6b7280", "#cfd4da", "#b4b9c1", "#e9ecef"
+"""... of stage and plates, column, dead weight and table."""
 HEAT = np.array(
     [[13, 8, 135], [76, 2, 161], [126, 3, 168], [170, 35, 149], [204, 71, 120], [230, 108, 92], [248, 149, 64], [253, 197, 39]]
 ) / 255.0  # fmt: skip
@@ -97,26 +99,27 @@ def arm_parts(arm: Arm, lane: Lane) -> dict[str, Part]:
 
     A module is drawn with the round section that has its stiffness, EI/EA = radius^2/4.
     """
+    turns = [coil_turns(module.rest_length(m)) for module in arm.modules for m in module.muscles]
+    places, base, number = [], 0.0, 0
+    for module in arm.modules:
+        counts = [RINGS, *(round(TURN * turns[number + i]) + 1 for i in range(len(module.muscles)))]
+        places += [np.minimum(base + module.length * np.linspace(0.0, 1.0, count), arm.length) for count in counts]
+        base, number = base + module.length, number + len(module.muscles)
+    poses = iter(np.split(arm.poses(lane, np.concatenate(places)), np.cumsum([s.size for s in places])[:-1]))
     result: dict[str, Part] = {}
-    base, muscle = 0.0, 0
+    number = 0
     for k, module in enumerate(arm.modules):
-        turns = [coil_turns(module.rest_length(m)) for m in module.muscles]
-        fractions = [np.linspace(0.0, 1.0, RINGS), *(np.linspace(0.0, 1.0, round(TURN * n) + 1) for n in turns)]
-        poses = np.split(
-            arm.poses(lane, np.minimum(base + module.length * np.concatenate(fractions), arm.length)),
-            np.cumsum([f.size for f in fractions])[:-1],
-        )
+        body = next(poses)
         radius = 2.0 * float(np.sqrt(module.stiffness[0] / module.stiffness[5]))
-        body = poses[0]
         result[f"module {k}"] = sweep(body[:, :3, 3], body[:, :3, 0], body[:, :3, 1], *circle(radius, CIRCLE), BODY)
         for end, pose in (("top", body[0]), ("bottom", body[-1])):
             result[f"plate {k} {end}"] = disc(pose, PLATE, PLATE_THICKNESS, METAL)
-        for m, fraction, frames, count in zip(module.muscles, fractions[1:], poses[1:], turns, strict=True):
-            route = module.route(m, fraction)[:, :2]
+        for muscle in module.muscles:
+            frames = next(poses)
+            route = module.route(muscle, np.linspace(0.0, 1.0, len(frames)))[:, :2]
             out = np.einsum("kij,kj->ki", frames[:, :3, :2], route)
-            result[f"coil {muscle}"] = coil(frames[:, :3, 3] + out, out, count, float(lane.drive[muscle]))
-            muscle += 1
-        base += module.length
+            result[f"coil {number}"] = coil(frames[:, :3, 3] + out, out, turns[number], float(lane.drive[number]))
+            number += 1
     return result
 
 
@@ -157,14 +160,14 @@ def ring_parts(mount: Array, gap: float, temperature: float | None) -> dict[str,
 
 def site_parts(lowered: float) -> dict[str, Part]:
     """Return stage, its column and the table; the stage is `lowered` so far [m]."""
-    edge, deep, thick = 11e-3, 21e-3, 1.5e-3
+    edge, deep, thick = 10e-3, 26e-3, 1.2e-3
     top = presets.SITE.table
     return {
         "stage": box(
             np.array([0.0, 0.5 * (edge - deep), lowered - thick - PLATE_THICKNESS]), (edge, 0.5 * (deep + edge), thick), METAL
         ),
-        "column": box(np.array([0.0, -deep, 0.5 * top - 7e-3]), (3e-3, 3e-3, 0.5 * top + 7e-3), METAL),
-        "table": box(np.array([0.0, 0.0, top + 1e-3]), (60e-3, 60e-3, 1e-3), TABLE),
+        "column": box(np.array([0.0, -deep, 0.5 * top - 7e-3]), (2.5e-3, 2.5e-3, 0.5 * top + 7e-3), RAIL),
+        "table": box(np.array([0.0, 0.0, top + 1e-3]), (TABLE_HALF, TABLE_HALF, 1e-3), TABLE),
     }
 
 
@@ -344,21 +347,22 @@ def _below(task: Task, record: Record) -> dict[str, Part]:
     beyond[:3, 3] += presets.TWISTING_LENGTH * tip[:3, 2]
     line = np.stack([tip[:3, 3], beyond[:3, 3]])
     first, second = (np.broadcast_to(tip[:3, i], (2, 3)) for i in (0, 1))
-    body = sweep(line, first, second, *circle(0.5 * presets.BODY_DIAMETER, CIRCLE), METAL)
-    return {"dead weight": body} | {name: part._replace(colour=METAL) for name, part in ring_parts(beyond, 0.0, None).items()}
+    body = sweep(line, first, second, *circle(0.5 * presets.BODY_DIAMETER, CIRCLE), DEAD)
+    return {"dead weight": body} | {name: part._replace(colour=DEAD) for name, part in ring_parts(beyond, 0.0, None).items()}
 
 
 def _goal(task: Task, record: Record) -> dict[str, Part]:
     """Return the goal as a ghost."""
     goal = record.goal[0]
     place = 1e-2 * goal[:3]
+    colour = DONE if batch.outcome(task, task.achieved(record)[0], goal).success else GOAL
     if isinstance(task, pick_and_place.PickAndPlace):
-        ghost = box(place, HALF_OBJECT, GOAL, turn=float(record.scene[0, grasp.YAW]))
+        ghost = box(place, HALF_OBJECT, colour, turn=float(record.scene[0, grasp.YAW]))
         spot = np.eye(4)
         spot[:3, 3] = place[0], place[1], presets.SITE.table - 0.1e-3
         return {
-            "goal": ghost._replace(opacity=0.45),
-            "goal place": disc(spot, 1e-2 * pick_and_place.SUCCESS_CM, 0.1e-3, GOAL)._replace(opacity=0.6),
+            "goal": ghost._replace(opacity=0.55),
+            "goal place": disc(spot, 1e-2 * pick_and_place.SUCCESS_CM, 0.1e-3, colour)._replace(opacity=0.6),
         }
     if isinstance(task, twist_align.TwistAlign):
         pose = np.eye(4)
@@ -367,10 +371,10 @@ def _goal(task: Task, record: Record) -> dict[str, Part]:
         pose[:3, 3] = place
         ghost_ring = ring_parts(pose, 0.0, None)
         return {
-            "goal": ball(place, 1e-2 * twist_align.SUCCESS_CM, GOAL, 0.6),
-            **{f"goal {name}": part._replace(colour=GOAL, opacity=0.35) for name, part in ghost_ring.items()},
+            "goal": ball(place, 1e-2 * twist_align.SUCCESS_CM, colour, 0.6),
+            **{f"goal {name}": part._replace(colour=colour, opacity=0.5) for name, part in ghost_ring.items()},
         }
-    return {"goal": ball(place, 1e-2 * reach.SUCCESS_CM, GOAL, 0.6)}
+    return {"goal": ball(place, 1e-2 * reach.SUCCESS_CM, colour, 1.0), "goal halo": ball(place, PLATE, colour, 0.4)}
 
 
 def heat_colour(temperature: Array | float) -> Array:

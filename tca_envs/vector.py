@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from tca_envs import batch, presets
+from tca_envs import batch, presets, render
 from tca_envs.batch import Observation
 from tca_envs.mechanics import Arm
 from tca_envs.tasks.core import solved
@@ -20,6 +20,8 @@ Lanes = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 NO_LANES = np.empty(0, dtype=np.intp)
+PICTURES = ("rgb_array", "depth_array")
+"""Render modes of many lanes."""
 FOR_ALL = ("compute_reward", "task", "reward", "arm", "render_mode", "spec")
 """What `call` and `get_attr` find that is the same for all lanes, beside the spaces."""
 
@@ -44,11 +46,17 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     threads : int, optional
         How many threads share the lanes; by default as many as Numba has. A forked process uses one, whatever is asked
         for. On a machine that is busy with other work one is faster: threads wait for each other.
+    render_mode : str, optional
+        "rgb_array" or "depth_array": `render` returns pictures of all lanes. A window is for one arm: `gymnasium.make`.
+    width, height, camera
+        As of `ArmEnv`.
 
     Raises
     ------
     ValueError
         If an argument is none of these.
+    gymnasium.error.DependencyNotInstalled
+        If a render mode is asked for and PyVista is missing.
     """
 
     def __init__(
@@ -61,6 +69,10 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
+        render_mode: str | None = None,
+        width: int = render.SIZE,
+        height: int = render.SIZE,
+        camera: render.Camera = "front",
     ) -> None:
         self.num_envs = _count("num_envs", num_envs)
         try:
@@ -73,7 +85,9 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # there, but only when it runs
         self.threads = most if threads is None else _count("threads", threads, most)
         self.task = batch.new_task(task, reward, split, tolerance)
-        self.metadata = {"render_modes": [], "autoreset_mode": mode}
+        self._renderer = render.new_renderer(render_mode, width, height, camera, PICTURES)
+        self.render_mode = render_mode
+        self.metadata = {"render_modes": list(PICTURES), "render_fps": render.FPS, "autoreset_mode": mode}
         self.reward = reward
         self.core = self.task.core(self.num_envs)
         self.core.threads = self.threads
@@ -172,6 +186,18 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         infos = {**_with_masks(info, np.ones(self.num_envs, dtype=np.bool_)), **final}
         return observation, reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, infos
 
+    def render(self) -> tuple[NDArray[Any], ...] | None:
+        """Return the pictures of all lanes, each as of `ArmEnv.render`; None without a render mode."""
+        renderer = self._renderer
+        if renderer is None:
+            return None
+        return tuple(renderer.render(self.task, self.core, lane) for lane in range(self.num_envs))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Release what pictures hold, see `gymnasium.vector.VectorEnv.close`."""
+        if self._renderer is not None:
+            self._renderer.close()
+
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
         """Return the reward of a goal (k,) as a float, or of a batch (..., k) as an array (...,); `info` is not read."""
         return batch.compute_reward(self.task, self.reward, achieved_goal, desired_goal)
@@ -203,7 +229,7 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         if name in ("np_random", "np_random_seed"):
             return tuple(getattr(self, name))
         if name == "metadata":
-            return tuple({"render_modes": []} for _ in range(self.num_envs))
+            return tuple({"render_modes": list(PICTURES), "render_fps": render.FPS} for _ in range(self.num_envs))
         if name in ("action_space", "observation_space"):
             name = f"single_{name}"
         elif name not in FOR_ALL:

@@ -7,10 +7,12 @@ The scenes are those that the environments step: the bending module with three T
 import itertools
 import time
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
+import tca_envs  # noqa: F401
 from tca_envs import presets
 from tca_envs.mechanics import Arm, Grid, shooting
 from tca_envs.mechanics.collocation import solve_lanes
@@ -152,3 +154,15 @@ def test_the_presets_keep_to_their_tolerance_cold_and_warm(build, payload, hotte
         warm_fine = finer.equilibrium(np.maximum(drive - 1.0, AMBIENT), start=fine, payload=payload)
         for a, b in ((coarse, fine), (warm, warm_fine)):
             assert np.linalg.norm(a.tip_pose[:3, 3] - b.tip_pose[:3, 3]) < presets.TOLERANCE
+
+
+@pytest.mark.benchmark(group="a picture of 480 x 480 pixels")
+@pytest.mark.parametrize("name", ["TCAReach-v0", "TCATwistAlign-v0", "TCAPickAndPlace-v0"])
+def test_picture(benchmark, drawing, name):
+    env = gym.make(name, render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    env.step(np.ones(env.action_space.shape, dtype=np.float32))
+    picture = benchmark(env.render)
+    env.close()
+    assert picture.shape == (480, 480, 3) and (picture != first).any()

@@ -26,23 +26,39 @@ BEATEN_BY: list[tuple[str, str, str]] = [("one-degree", "passive muscles ignored
 
 
 def test_there_are_examples():
-    assert len(EXAMPLES) == 6
+    assert len(EXAMPLES) == 7
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
-def test_examples_run(example):
+def test_examples_run(example, request):
+    if "render_mode" in example:
+        request.getfixturevalue("drawing")
     done = subprocess.run([sys.executable, "-W", "error", "-c", example], cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert done.stdout
     if "ReachController" in example:
         assert done.stdout.startswith("True")
+    if "render_mode" in example:
+        assert done.stdout == "(480, 640, 3)\n"
     if "policy.zip" in example:
         assert done.stdout.startswith("success 100.0 %")
 
 
 def test_files_that_it_names_exist():
-    for name in re.findall(r"\]\(([\w/.]+)\)", README) + re.findall(r"(?:python|pytest) ([\w/]+\.py)", README):
+    for name in re.findall(r"\]\(([\w/.-]+)\)", README) + re.findall(r"(?:python|pytest) ([\w/]+\.py)", README):
         assert (ROOT / name).exists(), name
+
+
+def test_animated_pictures_are_small_and_move():
+    image = pytest.importorskip("PIL.Image")
+    for task in ("reach", "twist-align", "pick-and-place"):
+        path = ROOT / "docs" / f"{task}.webp"
+        assert f"docs/{path.name}" in README and path.stat().st_size < 3e6
+        with image.open(path) as film:
+            assert film.n_frames > 50 and film.info["duration"] == 100
+            first = np.asarray(film.convert("RGB"), dtype=int)
+            film.seek(20)
+            assert np.abs(np.asarray(film.convert("RGB"), dtype=int) - first).max() > 100
 
 
 def test_commands_that_install_name_extras_that_exist():

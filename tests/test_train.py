@@ -223,6 +223,8 @@ def test_ray_is_needed_for_its_engine_only(monkeypatch, capsys):
         (["--engine", "ray", "--workers", "0"], "--workers 0: expected a positive integer"),
         (["--engine", "ray", "--seeds", "1", "-2"], "--seeds -2: expected an integer of at least 0"),
         (["--seeds", "1", "2"], "--seeds needs --benchmark or --engine ray"),
+        (["--video", "film.avi"], "--video film.avi: path = 'film.avi': expected a file name that ends with .mp4, .webp, .gif"),
+        (["--video", "a.gif", "--benchmark"], "--video is for one policy"),
     ],
 )
 def test_bad_arguments_are_told(arguments, message, capsys):

@@ -91,7 +91,8 @@ def test_every_id_has_its_native_vector_environment():
         single, other = gym.make(name), gym.make_vec(name, num_envs=2, vectorization_mode="sync")
         assert env.single_action_space == single.action_space and env.single_observation_space == single.observation_space
         assert env.action_space == other.action_space and env.observation_space == other.observation_space
-        assert env.metadata == other.metadata == {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
+        assert env.metadata == other.metadata | {"render_modes": ["rgb_array", "depth_array"]}  # a window is for one arm
+        assert env.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
         assert env.reset(seed=0)[0] in env.observation_space
         again = gym.make_vec(env.spec)
         assert type(again) is ArmVectorEnv and (again.num_envs, again.reward) == (2, env.reward)
@@ -420,7 +421,7 @@ def test_attributes_and_methods_of_lanes():
     assert_same(ours.reset(seed=0), theirs.reset(seed=0))
     for name in ("reward", "render_mode", "action_space", "observation_space", "np_random_seed"):
         assert ours.get_attr(name) == theirs.get_attr(name)
-    assert ours.get_attr("metadata") == ({"render_modes": []},) * LANES
+    assert ours.get_attr("metadata") == ({"render_modes": ["rgb_array", "depth_array"], "render_fps": 10},) * LANES
     goals = np.random.default_rng(0).normal(size=(2, 6, 3)).astype(np.float32)
     assert_same(ours.call("compute_reward", *goals, None), theirs.call("compute_reward", *goals, None))
     assert_same(ours.compute_reward(*goals, None), theirs.call("compute_reward", *goals, None)[0])

@@ -24,7 +24,7 @@ from tca_envs.study.scenes import LONG_DENSITY, Case
 Array = NDArray[np.float64]
 
 ROD_LENGTH, ROD_RADIUS, ROD_OFFSET = 45e-3, 4.5e-3, 4e-3
-"""The rod of the closed forms in docs/model.md and its tendon [m]."""
+"""The rod of the closed forms in docs/solver.md and its tendon [m]."""
 OFF_AXIS = 1.0
 """Gravity is so far off the planes of symmetry [deg]: no arm is mounted exactly, and a symmetric one may fall to any side."""
 TURNED = 20.0

@@ -90,6 +90,9 @@ class TwistAlign(Task):
     | `reward` | `"sparse"` (`"dense"` in TCATwistAlignDense-v0) | which reward |
     | `split` | `"train"` | where goals come from: `"train"` or `"held-out"` |
     | `tolerance` | 1e-5 | largest error of the tip [m], 1e-9 to 1e-3; the cheapest discretisation that keeps to it is chosen |
+    | `render_mode` | None | `"rgb_array"`, `"depth_array"`: what `render` returns; `"human"`: a window shows every step |
+    | `width`, `height` | 480 | size of pictures or the window [pixel] |
+    | `camera` | `"front"` | `"front"`, `"side"`, `"above"`, `"gripper"`, or where it stands and at what it looks [m] |
 
     ## Version History
 
