@@ -370,6 +370,12 @@ def test_visitors_do_not_disturb_one_another(browser, viewer, visitor, monkeypat
     assert not other.errors
 
 
+def test_no_visitor_can_open_a_tunnel(visitor, viewer, monkeypatch):
+    asked = []
+    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *where: asked.append(where) or 1 / 0)
+    assert viewer.server.request_share_url() is None and not asked
+
+
 def test_nothing_comes_from_elsewhere_and_the_console_is_quiet(visitor):
     assert not visitor.errors
     assert len(visitor.requests) > 1
