@@ -1,4 +1,4 @@
-"""Take a still of the viewer: python docs/viewer.py writes docs/viewer.png (needs the extras `viewer`, `test` and a Chromium)."""
+"""Take a still of the viewer: python docs/viewer.py writes docs/viewer.png (needs the extras `viewer` and `test`, Chromium)."""
 
 import shutil
 from pathlib import Path

@@ -1,6 +1,7 @@
 """The viewer: what a visitor plays with, without a page; the command line; and the page in a real headless Chromium."""
 
 import io
+import re
 import shutil
 import socket
 import sys
@@ -90,7 +91,7 @@ def test_a_payload_pulls_at_the_arm_and_goes_with_its_slider(task):
 def test_goals_do_not_depend_on_the_world():
     session = Session("twist-align", seed=5)
     goal = session.observation["desired_goal"]
-    session.world = World(gravity=-1.0, payload=5.0)
+    session.world = World(gravity=0.5, tilt=20.0, payload=5.0)
     session.step()
     session.reset(5)
     np.testing.assert_array_equal(session.observation["desired_goal"], goal)
@@ -194,6 +195,21 @@ def test_without_viser_the_command_line_says_what_to_install(monkeypatch, capsys
     with pytest.raises(SystemExit) as exit:
         main(["--port", "0"])
     assert exit.value.code == 2 and 'pip install "tca_envs[viewer]"' in capsys.readouterr().err
+
+
+def test_readings_tell_of_task_and_solver():
+    pytest.importorskip("viser", reason="needs viser: the extra `viewer`")
+    from tca_envs.viewer.page import length, readings
+
+    session = Session("twist-align", tolerance=1e-3)
+    session.step()
+    told = dict(re.findall(r'data-reading="([^"]*)">([^<]*)<', readings(session)))
+    assert told["time"] == "0.1 s" and told["distance"] == f"{session.info['distance_mm']:.2f} mm" and told["success"] == "no"
+    assert told["yaw error"] == f"{session.info['yaw_error_deg']:.1f}°" and told["energy"] == "0.0 J"
+    assert told["rung"].startswith("WARM") and told["converged"] == "yes" and told["jumped"] == "no"
+    assert told["stability"].endswith(", stable") and told["grid"] == "1 × 5 + 4 × 4 Gauss nodes"
+    assert told["tip error"] == f"{length(session.env.arm.discretisation.error)} of 1 mm"
+    assert [length(x) for x in (1e-3, 3.21e-4, 1e-5, 9.8e-7, 2.7e-9)] == ["1 mm", "320 µm", "10 µm", "0.98 µm", "2.7 nm"]
 
 
 SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -352,6 +368,12 @@ def test_visitors_do_not_disturb_one_another(browser, viewer, visitor, monkeypat
     until(lambda: not viewer.pages)
     until(lambda: not any(thread.name.startswith("visitor") for thread in threading.enumerate()))
     assert not other.errors
+
+
+def test_no_visitor_can_open_a_tunnel(visitor, viewer, monkeypatch):
+    asked = []
+    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *where: asked.append(where) or 1 / 0)
+    assert viewer.server.request_share_url() is None and not asked
 
 
 def test_nothing_comes_from_elsewhere_and_the_console_is_quiet(visitor):

@@ -284,7 +284,7 @@ def readings(session: Session) -> str:
         "jumped": "yes" if solve.jumped else "no",
         "stability": f"{solve.stability:.3f}, {'stable' if solve.stable else 'unstable'}",
         "grid": session.discretisation(),
-        "tip error": f"{1e6 * chosen.error:.2g} µm of {1e6 * chosen.tolerance:g} µm",
+        "tip error": f"{length(chosen.error)} of {length(chosen.tolerance)}",
     }
     stops = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255.0 * HEAT)
     bar = (
@@ -294,6 +294,12 @@ def readings(session: Session) -> str:
     )
     content = table("Task", task) + table("Solver", solver) + bar
     return f'<div style="font-size:0.8em;line-height:1.3;padding:0.2em 0.8em">{content}</div>'
+
+
+def length(metres: float) -> str:
+    """Return a length in two digits and a unit that fits."""
+    factor, unit = next((f, u) for f, u in ((1e3, "mm"), (1e6, "µm"), (1e9, "nm")) if metres * f >= 0.95 or u == "nm")
+    return f"{float(f'{factor * metres:.2g}'):g} {unit}"
 
 
 def table(title: str, rows: dict[str, str]) -> str:

@@ -9,6 +9,13 @@ from tca_envs.viewer.session import Session
 log = logging.getLogger(__name__)
 
 
+class Server(viser.ViserServer):
+    """viser's, which no visitor can show to the world."""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Open no tunnel: viser does for every browser that asks, its button hidden or not."""
+
+
 class Viewer:
     """A running web server.
 
@@ -21,7 +28,7 @@ class Viewer:
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 8080) -> None:
-        self.server = viser.ViserServer(host, port, verbose=False)
+        self.server = Server(host, port, verbose=False)
         self.server.scene.set_up_direction("-z")
         self.server.initial_camera.position, self.server.initial_camera.look_at = CAMERA, LOOK_AT
         self.server.initial_camera.fov = VIEW_RAD
