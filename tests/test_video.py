@@ -69,8 +69,11 @@ def test_the_command_line_films_a_policy(tmp_path, capsys, monkeypatch):
     pytest.importorskip("moviepy", reason='MoviePy is missing: pip install -e ".[video]"')
     monkeypatch.setattr(train, "FILMED_EPISODES", 1)
     path = tmp_path / "out.mp4"
+    filmed, frames = [], video.frames
+    monkeypatch.setattr(video, "frames", lambda policy, env, *how: filmed.append(env) or frames(policy, env, *how))
     assert train.main(["--task", "reach", "--eval-only", "pretrained", "--episodes", "2", "--video", str(path)]) == 0
     assert path.stat().st_size > 5_000
+    assert [env.unwrapped.task.split for env in filmed] == ["held-out"]
     assert f"wrote {path}" in capsys.readouterr().out
 
 

@@ -103,7 +103,8 @@ class Core:
         self.heating = heater.scaled(np.append(arm.rest_lengths, others))
         self._heating = thermal.constants(STEP_S, CUT_OFF, self.heating)
         self.load = arm.load()
-        """Gravity, and forces on the tips if any, as `kernels.LOAD` numbers; may be changed between steps."""
+        """Gravity, and forces on the tips if any, as `kernels.LOAD` numbers; may be changed between steps,
+        not before goals are drawn: arms settle under it."""
         self.rest, self.rest_report = self._rest(goal_size, scene_size)
         self.record = self.rest.rows(np.zeros(lanes, dtype=np.intp))
 

@@ -200,10 +200,11 @@ class Page:
 
     def _draw(self) -> None:
         """Show the arm as it is."""
-        parts = self.session.parts()
+        # A browser shows nothing where an opaque mesh gives way to a translucent one of the same name, as goals of tasks do.
+        parts = {f"{self.session.task}/{name}": part for name, part in self.session.parts().items()}
         for name, part in parts.items():
             colour = rgb(part)
-            if name not in self._meshes or len(part.vertices) != len(self._meshes[name][1].vertices):
+            if name not in self._meshes:
                 mesh = self.client.scene.add_mesh_simple(
                     f"/{name}", SCALE * part.vertices, part.triangles, color=colour,
                     opacity=None if part.opacity == 1.0 else part.opacity, cast_shadow=part.opacity == 1.0,
