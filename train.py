@@ -15,7 +15,7 @@ import json
 import os
 import platform
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -146,9 +146,8 @@ def film(policy: Policy, settings: dict[str, Any], path: Path) -> None:
     """Write a video of the first held-out episodes."""
     from agents.video import frames, save
 
-    env = gymnasium.make(settings["env"], split="held-out", render_mode="rgb_array")
-    save(frames(policy, env, FILMED_EPISODES, EVALUATION_SEED), path, env.metadata["render_fps"])
-    env.close()
+    with closing(gymnasium.make(settings["env"], split="held-out", render_mode="rgb_array")) as env:
+        save(frames(policy, env, FILMED_EPISODES, EVALUATION_SEED), path, env.metadata["render_fps"])
     print(f"wrote {path}")
 
 
@@ -246,10 +245,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
         try:
             check_path(options.video)
-        except ValueError as error:
+            options.video.parent.mkdir(parents=True, exist_ok=True)
+            import pyvista  # noqa: F401
+        except (ValueError, OSError) as error:
             fail(f"--video {options.video}: {error}")
         except ModuleNotFoundError as error:
-            fail(f"--video needs PyVista and MoviePy: pip install -e '.[train,video]' ({error})")
+            fail(f"--video needs PyVista, and MoviePy for .mp4: pip install -e '.[train,video]' ({error})")
     chosen = [name for name in ("eval_only", "resume", "tune", "benchmark") if getattr(options, name)]
     if options.video and (options.tune or options.benchmark or options.seeds):
         fail("--video is for one policy, not with --tune, --benchmark or --seeds")

@@ -30,6 +30,11 @@ def frames(policy: Policy, env: gymnasium.Env[Any, Any], episodes: int = 1, seed
         How many; each ends where the goal was held for HELD_STEPS.
     seed : int
         Episode i is seeded with `seed` + i.
+
+    Raises
+    ------
+    ValueError
+        For an environment with another render mode.
     """
     if env.render_mode != "rgb_array":
         raise ValueError(f"env has render_mode {env.render_mode!r}: expected 'rgb_array'")
@@ -47,11 +52,9 @@ def frames(policy: Policy, env: gymnasium.Env[Any, Any], episodes: int = 1, seed
 
 
 def check_path(path: Path) -> None:
-    """Raise ValueError for a path that `save` cannot write, ModuleNotFoundError if what it needs is missing."""
+    """Raise ValueError for a path that `save` cannot write, ModuleNotFoundError if MoviePy is missing for it."""
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"path = {str(path)!r}: expected a file name that ends with {', '.join(SUFFIXES)}")
-    import pyvista  # noqa: F401
-
     if path.suffix.lower() == ".mp4":
         import moviepy  # noqa: F401
 
@@ -62,9 +65,13 @@ def save(shown: Frames, path: Path, fps: int) -> None:
     Raises
     ------
     ValueError
-        For another suffix than SUFFIXES.
+        For another suffix than SUFFIXES, or without pictures.
+    ModuleNotFoundError
+        If MoviePy is missing and the suffix needs it.
     """
     check_path(path)
+    if not shown:
+        raise ValueError(f"shown = {shown!r}: expected pictures")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".mp4":
         from moviepy import ImageSequenceClip

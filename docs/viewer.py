@@ -23,8 +23,7 @@ def main() -> None:
         page.goto(viewer.url)
         page.get_by_role("button", name="Pause").click()
         page.get_by_role("button", name="PickAndPlace").click()
-        page.get_by_label("Driven by").first.click()
-        page.get_by_role("option", name="scripted").click()
+        page.get_by_role("button", name="scripted").click()
         page.get_by_label("Seed").first.fill(str(SEED))
         page.get_by_role("button", name="Reset").click()
         for note in page.locator(".mantine-Notification-closeButton").all():  # of viser: there is no graphics card

@@ -1,5 +1,6 @@
 """The Gymnasium environment: one lane of a task."""
 
+from copy import deepcopy
 from typing import Any
 
 import gymnasium
@@ -56,7 +57,7 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         self.task = batch.new_task(task, reward, split, tolerance)
         self._renderer = render.new_renderer(render_mode, width, height, camera)
         self.render_mode = render_mode
-        self.metadata = {"render_modes": list(render.MODES), "render_fps": render.FPS}
+        self.metadata = deepcopy(self.metadata)
         self.reward = reward
         self.core = self.task.core(1)
         self.action_space = batch.action_space(self.task)
@@ -98,7 +99,7 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
     def render(self) -> Any:
         """Return the picture (height, width, 3) uint8, or the distances (height, width) float32 [m] from the camera's plane.
 
-        None with "human", and without a render mode, see `gymnasium.Env.render`; `tca_envs.render` says what a picture shows.
+        None with "human", and without a render mode, see `gymnasium.Env.render`; docs/seeing.md says what a picture shows.
 
         Raises
         ------
@@ -124,7 +125,7 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
     def get_state(self) -> dict[str, Any]:
         """Return the episode, to the last bit, as arrays by name and the state of the random generator ("rng").
 
-        The count of steps belongs to Gymnasium's `TimeLimit` and is not part of it.
+        The count that Gymnasium's `TimeLimit` keeps is not part of it; "steps", which pictures show, is.
         """
         return {**batch.snapshot(self.core.record), "rng": self.np_random.bit_generator.state}
 

@@ -33,6 +33,8 @@ PLATE = 5.6e-3
 """Radius of the plates between which the coils hang [m]: just outside of them."""
 PLATE_THICKNESS = 0.8e-3
 """[m]."""
+HALF_OBJECT = (0.5 * presets.OBJECT.width, 0.5 * presets.OBJECT.length, 0.5 * presets.OBJECT.height)
+"""Half edges of the object [m]."""
 TABLE_HALF = 60e-3
 """Half an edge of the table [m]."""
 BODY, RING, OBJECT = "#efe9dc", "#a9cbdc", "#2f7d55"
@@ -90,7 +92,9 @@ def parts(task: Task, core: Core, lane: int = 0) -> dict[str, Part]:
     result = {name: moved(part, down) for name, part in result.items()}
     result |= _goal(task, record) | site_parts(float(down[2]))
     if isinstance(task, pick_and_place.PickAndPlace):
-        result["object"] = box(_place(record), HALF_OBJECT, OBJECT, turn=float(record.scene[0, grasp.YAW]))
+        result["object"] = box(
+            record.scene[0, grasp.X : grasp.Z + 1], HALF_OBJECT, OBJECT, turn=float(record.scene[0, grasp.YAW])
+        )
     return result
 
 
@@ -287,12 +291,15 @@ def _sweep_triangles(rings: int, sides: int) -> Triangles:
 
 
 @cache
-def _sphere(sides: int = 24, bands: int = 12) -> tuple[Array, Triangles]:
+def _sphere() -> tuple[Array, Triangles]:
     """Return directions and triangles of a sphere, with its poles as bands of no size."""
+    sides, bands = 24, 12
     polar, angle = np.linspace(0.0, pi, bands + 1), np.linspace(0.0, 2.0 * pi, sides, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], axis=1)
     directions = np.sin(polar)[:, np.newaxis, np.newaxis] * ring - np.cos(polar)[:, np.newaxis, np.newaxis] * [0.0, 0.0, 1.0]
-    return directions.reshape(-1, 3), _sweep_triangles(bands + 1, sides)[: 2 * sides * bands]
+    directions = directions.reshape(-1, 3)
+    directions.setflags(write=False)
+    return directions, _sweep_triangles(bands + 1, sides)[: 2 * sides * bands]
 
 
 def _around(line: Array, out: Array) -> tuple[Array, Array]:
@@ -302,13 +309,6 @@ def _around(line: Array, out: Array) -> tuple[Array, Array]:
     first = out - np.sum(out * tangent, axis=1, keepdims=True) * tangent
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(tangent, first)
-
-
-HALF_OBJECT = (0.5 * presets.OBJECT.width, 0.5 * presets.OBJECT.length, 0.5 * presets.OBJECT.height)
-
-
-def _place(record: Record) -> Array:
-    return record.scene[0, grasp.X : grasp.Z + 1]
 
 
 def _in(pose: Array, points: Array) -> Array:
@@ -374,7 +374,7 @@ def _goal(task: Task, record: Record) -> dict[str, Part]:
             "goal": ball(place, 1e-2 * twist_align.SUCCESS_CM, colour, 0.6),
             **{f"goal {name}": part._replace(colour=colour, opacity=0.5) for name, part in ghost_ring.items()},
         }
-    return {"goal": ball(place, 1e-2 * reach.SUCCESS_CM, colour, 1.0), "goal halo": ball(place, PLATE, colour, 0.4)}
+    return {"goal": ball(place, 1e-2 * reach.SUCCESS_CM, colour, 0.9), "goal halo": ball(place, PLATE, colour, 0.4)}
 
 
 def heat_colour(temperature: Array | float) -> Array:

@@ -6,6 +6,7 @@ Off screen it needs no display, but some OpenGL: that of a graphics driver or Me
 import importlib
 import importlib.util
 import time
+import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -114,10 +115,11 @@ class Renderer:
         self.size = (width, height)
         self.camera = camera
         self._scene: _Scene | None = None
+        self._step = -1  # that the window shows
         self._due = 0.0  # when the frame that is shown has been for long enough, in the time of `time.perf_counter`
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_scene": None}
+        return {**self.__dict__, "_scene": None, "_due": 0.0, "_step": -1}
 
     def render(self, task: Task, core: Core, lane: int = 0) -> Any:
         """Return the picture of a lane, (height, width, 3) uint8 or, as depth, (height, width) float32 [m]; None for a window.
@@ -135,11 +137,15 @@ class Renderer:
         parts = geometry.parts(task, core, lane)
         if self._scene is None:
             self._scene = _Scene(self.size, self.camera, parts, self.mode)
+            # PyVista keeps every plotter until it is closed, and many environments never are.
+            weakref.finalize(self, self._scene.close).atexit = False
         self._scene.show(parts, readout(task, core, lane))
         if self.mode == "human":
-            self._due = max(self._due, time.perf_counter())
-            self._scene.wait(self._due)
-            self._due += 1.0 / FPS
+            step = int(core.record.steps[lane])
+            if step != self._step:  # who draws a step again does not make it longer
+                self._step, self._due = step, max(self._due, time.perf_counter())
+                self._scene.wait(self._due)
+                self._due += 1.0 / FPS
             return None
         return self._scene.depth() if self.mode == "depth_array" else self._scene.image()
 
@@ -191,7 +197,7 @@ class _Scene:
         plotter.add_mesh(self.shadow, color=SHADOW, lighting=False, reset_camera=False)
         for place, strength in LIGHTS:
             plotter.add_light(pyvista.Light(position=MM * np.array(place), focal_point=MM * CENTRE, intensity=strength))
-        self.text = self._annotated(pyvista, height) if annotated else None
+        self.text = self._annotated(pyvista, width, height) if annotated else None
         plotter.camera.position, plotter.camera.focal_point = MM * camera[0], MM * camera[1]
         plotter.camera.up = (0.0, 0.0, -1.0)
         plotter.camera.view_angle = VIEW_DEG
@@ -208,21 +214,24 @@ class _Scene:
         """Note that the user closed the window; it goes once its events are done."""
         self.closed = True
 
-    def _annotated(self, pyvista: Any, height: int) -> Any:
-        """Add colour bar and readout; returns the latter."""
-        size = round(height * 0.026)
+    def _annotated(self, pyvista: Any, width: int, height: int) -> Any:
+        """Add colour bar and readout, as large as the shorter edge allows; returns the latter."""
+        edge = min(width, height)
+        across, up = edge / width, edge / height
+        size = round(0.026 * edge)
         table = pyvista.LookupTable(values=np.hstack([255.0 * geometry.heat_colour(HEAT_SCALE), np.full((256, 1), 255.0)]))
         table.scalar_range = AMBIENT, HARD_LIMIT
         mapper = pyvista.DataSetMapper(pyvista.Sphere())
         mapper.lookup_table = table
         self.plotter.add_scalar_bar(
             "°C", mapper=mapper, vertical=True, n_labels=4, fmt="%.0f", color=INK, title_font_size=size, label_font_size=size,
-            width=0.07, height=0.4, position_x=0.9, position_y=0.52, unconstrained_font_size=True,
+            width=0.07 * across, height=0.4 * up, position_x=1.0 - 0.1 * across, position_y=1.0 - 0.48 * up,
+            unconstrained_font_size=True,
         )  # fmt: skip
         text = self.plotter.add_text("", position=(0.0, 0.0), font_size=1, color=INK)
         text.prop.font_size = size
         text.prop.SetVerticalJustificationToTop()
-        text.SetPosition(0.03 * height, 0.97 * height)
+        text.SetPosition(0.03 * edge, height - 0.03 * edge)
         return text
 
     def show(self, parts: Mapping[str, Part], text: str) -> None:
@@ -250,6 +259,7 @@ class _Scene:
         window, found = self.plotter.render_window, vtkUnsignedCharArray()
         width, height = window.GetSize()
         window.GetPixelData(0, 0, width - 1, height - 1, 0, found, 0)
+        window.ReleaseCurrent()  # another thread may ask for the next one
         rows = vtk_to_numpy(found).reshape(height // FINER, FINER, -1)[::-1]
         total = sum(rows[:, i].astype(np.uint16) for i in range(FINER)).reshape(height // FINER, width // FINER, FINER, 3)
         return (sum(total[:, :, i] for i in range(FINER)) // FINER**2).astype(np.uint8)
@@ -257,6 +267,7 @@ class _Scene:
     def depth(self) -> NDArray[np.float32]:
         """Return the distances from the camera's plane (height, width) [m]."""
         deep = -self.plotter.get_image_depth(fill_value=-np.inf, reset_camera_clipping_range=False)
+        self.plotter.render_window.ReleaseCurrent()
         return np.ascontiguousarray(deep[::FINER, ::FINER] / MM, dtype=np.float32)
 
     def wait(self, until: float) -> None:
@@ -288,12 +299,14 @@ def _plotter(pyvista: Any, size: tuple[int, int], window: bool) -> Any:
         plotter = pyvista.Plotter(off_screen=not window, window_size=size, lighting="none", title="tca_envs", notebook=False)
         kind = plotter.render_window.GetClassName()
         if window and kind in ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"):
+            plotter.close()
             raise RuntimeError(
                 "render_mode = 'human' needs a display to open a window on, and there is none (DISPLAY on Linux); "
                 "'rgb_array' needs none"
             )
         plotter.render_window.Initialize()
         if not window and plotter.render_window.GetGenericContext() is None:
+            plotter.close()
             raise RuntimeError(
                 "no OpenGL to draw with: neither a display nor EGL nor OSMesa was found; Mesa draws in software, on Debian and "
                 "Ubuntu: apt install libegl1 libgl1-mesa-dri"

@@ -224,8 +224,10 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         Raises
         ------
         AttributeError
-            For a name that is not among `FOR_ALL`, the spaces, "metadata", "np_random" and "np_random_seed".
+            For a name that is not among `FOR_ALL`, the spaces, "metadata", "render", "np_random" and "np_random_seed".
         """
+        if name == "render":
+            return self.render() or (None,) * self.num_envs
         if name in ("np_random", "np_random_seed"):
             return tuple(getattr(self, name))
         if name == "metadata":

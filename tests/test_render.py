@@ -1,6 +1,7 @@
 """What is drawn is what was solved, in pictures, depths, videos and a window."""
 
 import copy
+import gc
 import itertools
 import os
 import pickle
@@ -8,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium as gym
 import numpy as np
@@ -411,6 +413,50 @@ def test_stable_baselines_takes_pictures_and_videos(tmp_path, drawing):
     assert len(list(tmp_path.glob("*.mp4"))) == 1
 
 
+def test_any_thread_may_draw(drawing):
+    env = hot("TCAReach-v0", render_mode="rgb_array")
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(env.render).result()
+        assert np.array_equal(env.render(), first)
+        env.step(np.ones(3, dtype=np.float32))
+        second = env.render()
+        assert np.array_equal(pool.submit(env.render).result(), second) and not np.array_equal(first, second)
+    env.close()
+
+
+def test_environments_that_nobody_closes_release_what_they_drew_with(drawing):
+    from pyvista.plotting.plotter import _ALL_PLOTTERS
+
+    gc.collect()
+    before = len(_ALL_PLOTTERS)
+    env = hot("TCAReach-v0", render_mode="rgb_array")
+    env.render()
+    assert len(_ALL_PLOTTERS) == before + 1
+    del env
+    gc.collect()
+    assert len(_ALL_PLOTTERS) == before
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_goals_are_ghosts_that_depth_knows_nothing_of(name, drawing):
+    env = hot(name, render_mode="depth_array")
+    before = env.render()
+    env.unwrapped.core.record.goal[0, :2] += 0.8
+    assert np.array_equal(env.render(), before)
+    env.close()
+
+
+@pytest.mark.parametrize("size", [(96, 192), (192, 96)])
+def test_readout_and_colour_bar_fit_narrow_pictures(size, drawing):
+    width, height = size
+    env = gym.make("TCAPickAndPlace-v0", render_mode="rgb_array", width=width, height=height)
+    env.reset(seed=0)
+    inked = env.render()[: round(0.4 * min(size))].min(axis=2) < 200
+    assert not inked[:, -1].any() and not inked[:, 0].any() and not inked[0].any()
+    assert inked[:, -round(0.15 * min(size)) :].any() and inked[:, : round(0.4 * min(size))].any()
+    env.close()
+
+
 # --- errors -----------------------------------------------------------------------------------------------------------------
 
 
@@ -473,6 +519,7 @@ print("kind", scene.plotter.render_window.GetClassName(), scene.plotter.render_w
 begun = time.perf_counter()
 for _ in range(10):
     env.step(np.ones(3, dtype=np.float32))
+    env.render()  # changes nothing
 print("seconds", time.perf_counter() - begun)
 before = scene.plotter.camera.position
 subprocess.run("xdotool mousemove 60 100 mousedown 1 mousemove 100 110 mousemove 150 130 mouseup 1".split(), check=True)

@@ -421,6 +421,7 @@ def test_attributes_and_methods_of_lanes():
     assert_same(ours.reset(seed=0), theirs.reset(seed=0))
     for name in ("reward", "render_mode", "action_space", "observation_space", "np_random_seed"):
         assert ours.get_attr(name) == theirs.get_attr(name)
+    assert ours.call("render") == theirs.call("render") == (None,) * LANES
     assert ours.get_attr("metadata") == ({"render_modes": ["rgb_array", "depth_array"], "render_fps": 10},) * LANES
     goals = np.random.default_rng(0).normal(size=(2, 6, 3)).astype(np.float32)
     assert_same(ours.call("compute_reward", *goals, None), theirs.call("compute_reward", *goals, None))

@@ -82,4 +82,4 @@ def test_without_moviepy_the_extra_is_named(monkeypatch, capsys):
     with pytest.raises(SystemExit) as stop:
         train.main(["--eval-only", "pretrained", "--video", "out.mp4"])
     assert stop.value.code == 2
-    assert "--video needs PyVista and MoviePy: pip install -e '.[train,video]'" in capsys.readouterr().err
+    assert "--video needs PyVista, and MoviePy for .mp4: pip install -e '.[train,video]'" in capsys.readouterr().err

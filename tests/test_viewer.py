@@ -339,9 +339,40 @@ def test_keys_move_the_world_a_button_changes_the_task_and_reset_begins_again(vi
     until(lambda: session.time == 0.0)
 
 
+def test_every_task_shows_its_own_meshes(visitor):
+    for task in ("Reach", "TwistAlign", "PickAndPlace", "Reach"):
+        visitor.press(task)
+        name = {"Reach": "reach", "TwistAlign": "twist-align", "PickAndPlace": "pick-and-place"}[task]
+        until(lambda name=name: visitor.server.session.task == name and all(key.startswith(name) for key in meshes(visitor)))
+        shown = visitor.server.session.parts()
+        assert {f"{name}/{key}" for key in shown} == set(meshes(visitor))
+        for key, part in shown.items():
+            handle = meshes(visitor)[f"{name}/{key}"][0]
+            assert handle.opacity == (None if part.opacity == 1.0 else part.opacity), key
+            assert len(handle.vertices) == len(part.vertices)
+
+
+def meshes(visitor):
+    return dict(visitor.server._meshes)
+
+
+def test_who_types_beyond_a_range_is_kept_in_it(visitor):
+    page, session = visitor.page, visitor.server.session
+    beside = visitor.slider("Payload [g]").locator("xpath=following-sibling::*//input")
+    visitor.press("Run")
+    beside.fill("50")
+    until(lambda: visitor.server.session.world.payload == 5.0)
+    beside.fill("0")
+    page.get_by_label("Seed").first.fill("-5")
+    visitor.press("Reset")
+    until(lambda: visitor.server.session.seed == 0)
+    visitor.press("Pause")
+    until(lambda: not visitor.server.running)
+    assert page.get_by_text("This page has stopped").count() == 0 and visitor.server.session is session
+
+
 def test_the_scripted_controller_drives_and_its_sliders_show_it(visitor):
-    visitor.page.get_by_label("Driven by").first.click()
-    visitor.page.get_by_role("option", name="scripted").click()
+    visitor.page.get_by_role("button", name="scripted").click()
     until(lambda: visitor.server.session.controller == "scripted")
     session = visitor.server.session
     visitor.run(lambda: session.time >= 0.6 and session.core.record.power[0].any())

@@ -19,9 +19,12 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if not 0 <= options.port <= 65535:
         parser.error(f"--port {options.port}: expected a number from 0 to 65535")
+    if not options.host:  # which would be every address
+        parser.error("--host '': expected an address")
     try:
         # viser goes on to the next port where one is taken, and never comes back where the address is not this machine's.
-        socket.create_server((options.host, options.port)).close()
+        family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
+        socket.create_server((options.host, options.port), family=family).close()
     except OSError as error:
         parser.error(f"--host {options.host} --port {options.port}: expected this machine's address and a free port ({error})")
     try:

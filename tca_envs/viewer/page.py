@@ -108,8 +108,8 @@ class Page:
             self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
             self._single = gui.add_button("Step by 0.1 s", icon=viser.Icon.PLAYER_TRACK_NEXT, disabled=True)
         with gui.add_folder("Drive"):
-            there = [name for name, kind in CONTROLLERS.items() if not kind.missing()]
-            self._controller = gui.add_dropdown("Driven by", there, initial_value=MANUAL)
+            there = tuple(name for name, kind in CONTROLLERS.items() if not kind.missing())
+            self._controllers = gui.add_button_group("Driven by", there)
             for name, kind in CONTROLLERS.items():
                 if kind.missing():
                     gui.add_markdown(f"*{name}: {kind.missing()}*")
@@ -134,18 +134,22 @@ class Page:
         when(self._reset.on_click, self._reset_episode)
         when(self._pause.on_click, self._pause_or_run)
         when(self._single.on_click, self._step)
-        when(self._controller.on_update, self._change_controller)
+        when(self._controllers.on_click, lambda: self._change_controller(self._controllers.value))
         self._show_controls()
 
     def _begin(self, task: str) -> None:
         """Start over with a task and the tolerance that is chosen."""
-        self.session = Session(task, TOLERANCES[self._tolerance.value], self._seed.value)
-        self._change_controller()
+        controller = self.session.controller
+        self.session = Session(task, TOLERANCES[self._tolerance.value], self._chosen_seed())
+        self._change_controller(controller)
         self._show_controls()
 
     def _reset_episode(self) -> None:
-        self.session.reset(self._seed.value)
+        self.session.reset(self._chosen_seed())
         self._show_controls()
+
+    def _chosen_seed(self) -> int:
+        return int(within(self._seed))
 
     def _pause_or_run(self) -> None:
         self.running = not self.running
@@ -153,16 +157,15 @@ class Page:
         self._pause.icon = viser.Icon.PLAYER_PAUSE if self.running else viser.Icon.PLAYER_PLAY
         self._single.disabled = self.running
 
-    def _change_controller(self) -> None:
-        self._controller.disabled = True  # the first policy takes seconds to load
-        self.session.drive_by(self._controller.value)
-        self._controller.disabled = False
+    def _change_controller(self, controller: str) -> None:
+        self.session.drive_by(controller)
+        self._name()
         for slider in self._sliders:
             slider.disabled = self.session.controller != MANUAL
 
     def _step(self) -> None:
         session = self.session
-        session.world = World(self._gravity.value, self._tilt.value, self._payload.value)
+        session.world = World(within(self._gravity), within(self._tilt), within(self._payload))
         if session.controller == MANUAL:
             session.command[:] = [slider.value for slider in self._sliders[: len(session.controls)]]
         session.step()
@@ -175,7 +178,7 @@ class Page:
         """Show what belongs to the session's task, and where it is."""
         # Nothing is removed: a browser that is behind would complain of what came last for it.
         session = self.session
-        self.client.gui.set_panel_label(next(name for name, task in TASKS.items() if task == session.task))
+        self._name()
         for number, slider in enumerate(self._sliders):
             slider.visible = number < len(session.controls)
             slider.value = 0.0  # type: ignore[misc]  # viser has a setter
@@ -187,6 +190,11 @@ class Page:
         with self.client.atomic():
             self._draw()
             self._tell()
+
+    def _name(self) -> None:
+        """Say which task it is and what drives the arm."""
+        name = next(name for name, task in TASKS.items() if task == self.session.task)
+        self.client.gui.set_panel_label(f"{name}, {self.session.controller}")
 
     def _new_plots(self) -> list[viser.GuiUplotHandle]:
         """Return plots of temperatures and tensions of the session's TCAs."""
@@ -229,6 +237,11 @@ class Page:
         if session.controller != MANUAL:
             for slider, value in zip(self._sliders, session.command.tolist(), strict=False):
                 slider.value = min(round(value, 2), slider.max)  # type: ignore[misc]  # viser has a setter
+
+
+def within(given: Any) -> float:
+    """Return the number of a slider or a box, in its range: while a visitor types a browser sends what is not."""
+    return float(np.clip(given.value, given.min, given.max))
 
 
 def chart(
