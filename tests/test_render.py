@@ -542,6 +542,32 @@ for name in sorted(name for name, spec in gymnasium.registry.items() if "tca_env
 """
 
 
+def test_a_step_is_shown_once_for_a_tenth_of_a_second():
+    class Window:
+        closed = False
+
+        def __init__(self):
+            self.waited = []
+
+        def show(self, parts, text):
+            pass
+
+        def wait(self, until):
+            self.waited.append(until)
+
+    env = hot("TCAReach-v0", steps=1)
+    core = env.unwrapped.core
+    renderer = render.Renderer("human", 64, 64, tuple(np.array(point) for point in render.CAMERAS["front"]))
+    renderer._scene = window = Window()
+    for _ in range(3):  # as who calls `render` after `step`, which has drawn already
+        renderer.render(env.unwrapped.task, core)
+    assert len(window.waited) == 1
+    for _ in range(3):
+        core.record.steps += 1
+        renderer.render(env.unwrapped.task, core)
+    assert np.diff(window.waited).min() > 0.0999
+
+
 @pytest.fixture
 def display(drawing, tmp_path):
     if not (shutil.which("Xvfb") and shutil.which("xdotool")):
