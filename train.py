@@ -282,18 +282,15 @@ def read_description(folder: Path) -> dict[str, Any]:
     return description
 
 
-def learner(algorithm: str, engine: str = "sb3") -> Any:
-    """Return the class of an algorithm: Stable-Baselines3's, or our own in its form. HER is SAC with another buffer."""
-    import stable_baselines3
-
-    from agents.dagger import DAgger
-
+def learner(algorithm: str, engine: str) -> Any:
+    """Return the class of an algorithm for an engine."""
     if engine == "ray":
         from agents.ray_engine import RayPPO
 
         return RayPPO
-    own = {"dagger": DAgger, "her": stable_baselines3.SAC}
-    return own[algorithm] if algorithm in own else getattr(stable_baselines3, algorithm.upper())
+    from agents import policies
+
+    return policies.learner(algorithm)
 
 
 def environments(settings: dict[str, Any], seed: int) -> Any:

@@ -1,4 +1,4 @@
-"""Policies of Stable-Baselines3 whose networks are shown `agents.features.Features`: as its own otherwise."""
+"""What learns: policies of Stable-Baselines3 whose networks are shown `agents.features.Features`, and learners by name."""
 
 from typing import Any
 
@@ -20,3 +20,13 @@ class SoftActorCritic(MultiInputPolicy):
 
     def __init__(self, *spaces: Any, **options: Any) -> None:
         super().__init__(*spaces, **{"features_extractor_class": Features, **options})
+
+
+def learner(algorithm: str) -> Any:
+    """Return the class of an algorithm: Stable-Baselines3's, or our own in its form. HER is SAC with another buffer."""
+    import stable_baselines3
+
+    from agents.dagger import DAgger
+
+    own = {"dagger": DAgger, "her": stable_baselines3.SAC}
+    return own[algorithm] if algorithm in own else getattr(stable_baselines3, algorithm.upper())

@@ -10,6 +10,7 @@ import pytest
 import train
 from agents.evaluate import evaluate, lanes_for
 from agents.hyperparameters import DEFAULT_ALGORITHM
+from agents.policies import learner
 
 FOLDERS = sorted((Path(train.__file__).parent / "agents" / "pretrained").iterdir())
 GOALS = 50
@@ -24,7 +25,7 @@ def test_it_solves_held_out_episodes_as_often_as_reported(folder):
     report = json.loads((folder / "report.json").read_text())
     algorithm = report["algo"]
     assert report["task"] == folder.name and algorithm == DEFAULT_ALGORITHM[folder.name]
-    policy = train.learner(algorithm).load(folder / "policy.zip", device="cpu")
+    policy = learner(algorithm).load(folder / "policy.zip", device="cpu")
     env = gym.make_vec(report["env"], GOALS, split="held-out")
     found = evaluate(policy, env, GOALS, train.EVALUATION_SEED)
     # Some of the report's 200 episodes: four standard deviations of a binomial below, and one episode.

@@ -20,7 +20,7 @@ class Heated(core.Core):
     def __init__(self, task):
         vars(self).update(vars(task.core(torture.LANES)))
 
-    def _solve(self, record, temperature, heat=None):
+    def _solve(self, record, temperature, external, heat=None):
         asked = 0.5 * (heat.action + 1.0) * self.heating.max_power
         allowed = thermal.power_to_reach(record.temperature, core.CUT_OFF, core.STEP_S, self.heating)
         power = np.clip(allowed, 0.0, asked)

@@ -185,7 +185,7 @@ class Watched(Core):
         self.longest = 0
         self.failed: list[Asked] = []
 
-    def _solve(self, record: Record, temperature: Array, heat: Heat | None = None) -> Array:
+    def _solve(self, record: Record, temperature: Array, external: Array, heat: Heat | None = None) -> Array:
         reports = []
         for lane in range(len(temperature)):
             rows = slice(lane, lane + 1)
@@ -197,7 +197,7 @@ class Watched(Core):
                 else heat._replace(action=heat.action[rows], temperature=heat.temperature[rows], power=heat.power[rows])
             )
             wall, cpu = time.perf_counter_ns(), time.thread_time_ns()
-            report = super()._solve(one, temperature[rows], warmth)
+            report = super()._solve(one, temperature[rows], external, warmth)
             cpu, wall = time.thread_time_ns() - cpu, time.perf_counter_ns() - wall
             asked = Asked(start, temperature[lane, : start.size].copy(), float(one.payload[0, 0]))
             if self.slowest is None or cpu > self.longest:

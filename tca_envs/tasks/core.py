@@ -103,8 +103,7 @@ class Core:
         self.heating = heater.scaled(np.append(arm.rest_lengths, others))
         self._heating = thermal.constants(STEP_S, CUT_OFF, self.heating)
         self.load = arm.load()
-        """Gravity, and forces on the tips if any, as `kernels.LOAD` numbers; may be changed between steps,
-        not before goals are drawn: arms settle under it."""
+        """Gravity, and forces on the tips if any, as `kernels.LOAD` numbers, of steps; may be changed between them."""
         self.rest, self.rest_report = self._rest(goal_size, scene_size)
         self.record = self.rest.rows(np.zeros(lanes, dtype=np.intp))
 
@@ -127,19 +126,21 @@ class Core:
             goal=np.zeros((1, goal_size)),
             scene=np.zeros((1, scene_size)),
         )
-        report = self._solve(record, ambient.copy())
+        report = self._solve(record, ambient.copy(), self.arm.load())
         if not solved(report).all():
             raise RuntimeError(f"the arm has no equilibrium at {self.heating.ambient:g} degC to start from")
         return record, report
 
-    def _solve(self, record: Record, temperature: Array, heat: Heat | None = None) -> Array:
+    def _solve(self, record: Record, temperature: Array, external: Array, heat: Heat | None = None) -> Array:
         """Bring lanes to equilibrium at `temperature` (N, m), or at what `heat` makes of it; returns the report (N, REPORT).
+
+        `external` (LOAD,) is the load without the lanes' payloads.
 
         Where there is none, they stay as they are.
         """
         report = np.empty((len(temperature), REPORT))
         load = np.empty((len(temperature), LOAD))
-        load[:] = self.load
+        load[:] = external
         load[:, PAYLOAD_MASS:] = record.payload
         ladder.solve(
             self.arm, record.strain, record.tension, record.drive, record.load, temperature, load,
@@ -176,10 +177,10 @@ class Core:
         power, temperature = np.empty_like(record.power), np.empty_like(record.temperature)
         action = np.ascontiguousarray(action, dtype=np.float64)
         record.steps += 1
-        return self._solve(record, temperature, Heat(action, record.temperature, power, self._heating))
+        return self._solve(record, temperature, self.load, Heat(action, record.temperature, power, self._heating))
 
     def settle(self, temperature: Array, payload: Array | None = None) -> tuple[Record, NDArray[np.bool_]]:
-        """Heat arms from rest to steady temperatures, as constant powers do.
+        """Heat arms from rest to steady temperatures under their own load, as constant powers do.
 
         The way there is part of the answer: near 150 degC an arm with one hot TCA has several equilibria, because it can
         buckle to either side. Where the branch of equilibria ends on the way, so that the arm falls, it is in doubt which.
@@ -204,6 +205,6 @@ class Core:
         if payload is not None:
             record.payload[:] = payload
         for done in RAMP:
-            report = self._solve(record, self.heating.ambient + done * (target - self.heating.ambient))
+            report = self._solve(record, self.heating.ambient + done * (target - self.heating.ambient), self.arm.load())
             good &= solved(report) & (report[:, 3] == 0.0)
         return record, good

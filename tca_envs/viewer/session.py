@@ -135,7 +135,6 @@ class Session:
         """Start the episode that belongs to a seed; what drives the arm and the world stay as they are."""
         if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
             raise ValueError(f"seed = {seed!r}: expected an integer of at least 0")
-        self.core.load[6:9] = self._gravity  # the goals are the task's, not those of another world
         self.observation, self.info = self.env.reset(seed=seed)
         self.seed = seed
         self.command = np.zeros(len(self.controls))
@@ -253,14 +252,12 @@ def _scripted(task: str) -> Policy:
 @cache
 def _pretrained(task: str) -> Policy:
     """Return the policy that comes along for a task; it remembers nothing, so that visitors share it."""
-    from stable_baselines3 import PPO, SAC
-
-    from agents.dagger import DAgger
+    from agents.policies import learner
 
     folder = _pretrained_folder() / task
     algorithm = json.loads((folder / "policy.json").read_text())["algo"]
-    learner: Any = {"ppo": PPO, "sac": SAC, "dagger": DAgger}[algorithm]
-    return learner.load(folder / "policy.zip", device="cpu")
+    policy: Policy = learner(algorithm).load(folder / "policy.zip", device="cpu")
+    return policy
 
 
 def _pretrained_folder() -> Path:
