@@ -134,9 +134,7 @@ class Core:
     def _solve(self, record: Record, temperature: Array, external: Array, heat: Heat | None = None) -> Array:
         """Bring lanes to equilibrium at `temperature` (N, m), or at what `heat` makes of it; returns the report (N, REPORT).
 
-        `external` (LOAD,) is the load without the lanes' payloads.
-
-        Where there is none, they stay as they are.
+        Where there is none, they stay as they are. `external` (LOAD,) is their load but for their payloads.
         """
         report = np.empty((len(temperature), REPORT))
         load = np.empty((len(temperature), LOAD))
