@@ -8,8 +8,8 @@ import torch
 import tca_envs  # noqa: F401
 from agents.features import Features
 from agents.hyperparameters import HYPERPARAMETERS, for_learner
+from agents.policies import learner
 from agents.sb3 import make
-from train import learner
 
 
 @pytest.mark.parametrize("task", ["reach", "twist-align"])

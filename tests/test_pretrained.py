@@ -38,7 +38,7 @@ def test_it_solves_held_out_episodes_as_often_as_reported(folder):
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_all_of_its_reports_episodes(folder):
     report = json.loads((folder / "report.json").read_text())
-    policy = train.learner(report["algo"]).load(folder / "policy.zip", device="cpu")
+    policy = learner(report["algo"]).load(folder / "policy.zip", device="cpu")
     expected = report["held_out"][report["algo"]]
     env = gym.make_vec(report["env"], lanes_for(expected["episodes"]), split="held-out")
     found = evaluate(policy, env, expected["episodes"], report["evaluation_seed"])
