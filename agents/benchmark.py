@@ -1,7 +1,7 @@
 """The benchmark: every task by every algorithm with several seeds, as a table and a figure of learning curves.
 
-`python train.py --benchmark` trains with the settings of `agents.hyperparameters`, exactly as `python train.py` does, and
-evaluates each policy on held-out goals of its own seed, the scripted controller and a random policy on the same.
+`python train.py --benchmark` trains with the settings of `agents.hyperparameters`, as `python train.py` does. Each policy is
+evaluated on the held-out goals of its seed; the scripted controller and a random policy are evaluated on the same goals.
 """
 
 import csv
@@ -17,32 +17,32 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium.spaces import flatdim
 
-import train
-from agents import curve
+from agents import curve, training
 from agents.evaluate import Episodes, Policy, lanes_for, run, summary, wilson
 from agents.fastest import fastest
-from agents.hyperparameters import DEFAULT_ALGORITHM, HYPERPARAMETERS
-from agents.scripted import CONTROLLERS, Array, RandomPolicy
-from tca_envs.study.output import markdown_table, save_figure, write_csv
+from agents.hyperparameters import default_algorithm, settings_of
+from agents.output import markdown_table, save_figure, write_csv
+from agents.scripted import Array, RandomPolicy, controller_of
+from agents.training import Job
+from tca_envs import registry
+from tca_envs.registry import Entry
 
 REFERENCES = ("random", "scripted")
-"""What stands beside the algorithms."""
+"""Policies that the algorithms are compared with."""
 GOALS_APART = 10_000
-"""The held-out goals of seed s are drawn with seeds from `train.EVALUATION_SEED` + s times this on: no two share a goal."""
+"""The held-out goals of seed s are drawn with seeds from `training.EVALUATION_SEED` + s times this on: no two share a goal."""
 EPISODES, QUICK_EPISODES = 200, 10
 """Held-out episodes of each run."""
 QUICK_SHARE = 0.01
-"""Of the steps, in a quick look."""
-TITLES = {"reach": "Reach", "twist-align": "TwistAlign", "pick-and-place": "PickAndPlace"}
+"""Share of the steps that a quick benchmark trains."""
 NAMES = {"ppo": "PPO", "sac": "SAC", "her": "SAC + HER", "dagger": "DAgger"}
 
 
 @dataclass(frozen=True)
 class Run:
-    """One training, or what it is compared with."""
+    """One training, or the evaluation of a reference."""
 
     task: str
     policy: str
@@ -53,23 +53,33 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        """Where it lands."""
-        return self.out / "runs" / f"{self.task}-{self.policy}-seed{self.seed}"
+        """Folder of the run."""
+        return self.out / "runs" / f"{self.entry.name}-{self.policy}-seed{self.seed}"
+
+    @property
+    def entry(self) -> Entry:
+        """What belongs to the task."""
+        return registry.entry(self.task)
+
+    @property
+    def env(self) -> str:
+        """Id of the environment in which controllers are evaluated."""
+        return str(next(iter(settings_of(self.task).values()))["env"])
 
     @property
     def report(self) -> Path:
-        """What it leaves at last."""
+        """Path of its report, which is written last."""
         return self.folder / "report.json"
 
     @property
     def episodes(self) -> int:
-        """Held-out episodes."""
+        """Number of held-out episodes."""
         return QUICK_EPISODES if self.quick else EPISODES
 
     @property
     def goals(self) -> int:
         """First seed of the held-out goals."""
-        return train.EVALUATION_SEED + GOALS_APART * self.seed
+        return training.EVALUATION_SEED + GOALS_APART * self.seed
 
 
 def benchmark(
@@ -80,28 +90,28 @@ def benchmark(
     quick: bool = False,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Train, evaluate and write the table and the figure; a run whose report is there already is not repeated.
+    """Train, evaluate and write the table and the figure; runs that have a report are not repeated.
 
     Parameters
     ----------
     out : pathlib.Path
-        Gets `benchmark.md`, `benchmark.csv`, `runs.csv`, `curves.csv`, `curves.png`, and each run's folder under `runs`.
+        Folder of `benchmark.md`, `benchmark.csv`, `runs.csv`, `curves.csv`, `curves.png`, and of each run under `runs`.
     tasks : sequence of str
-        Of `agents.hyperparameters.HYPERPARAMETERS`.
+        Names in `tca_envs.registry`.
     seeds : sequence of int
         Each algorithm is trained with each of them.
     jobs : int
         Runs at a time; they share the processor's threads.
     quick : bool
-        A hundredth of the steps and few episodes: whether everything works.
+        Train a hundredth of the steps and evaluate few episodes, as a check.
     say : callable
-        Called with a line for each run that is done.
+        Called with a line of text after each run.
     """
     runs = [Run(task, policy, seed, quick, out) for task in tasks for policy in policies(task) for seed in seeds]
-    for task in tasks:
+    for task in (task for task in tasks if registry.entry(task).fastest is not None):
         for seed in seeds:
             say(f"least times of {task}, seed {seed}: {least_times(Run(task, 'scripted', seed, quick, out)).mean():.2f} s")
-    # The longest ones, those of the last task, first: then no process is left alone with one at the end.
+    # The longest runs, those of the last task, start first, so that all processes end at about the same time.
     missing = [one for one in reversed(runs) if not one.report.exists()]
     for done in each(perform, missing, jobs):
         say(line(done))
@@ -109,12 +119,13 @@ def benchmark(
 
 
 def policies(task: str) -> list[str]:
-    """Return the rows of a task's table."""
-    return [*REFERENCES, *(name for name in NAMES if name in HYPERPARAMETERS[task])]
+    """Return the policies of a task's table."""
+    known, controlled = settings_of(task), registry.entry(task).controller is not None
+    return ["random", *(["scripted"] if controlled else []), *(name for name in NAMES if name in known)]
 
 
 def each(work: Callable[[Run], Run], runs: list[Run], jobs: int) -> Iterable[Run]:
-    """Yield what `work` returns for each run, in processes of their own if `jobs` > 1."""
+    """Yield the result of `work` for each run, in separate processes if `jobs` > 1."""
     if jobs == 1:
         yield from map(work, runs)
         return
@@ -133,7 +144,7 @@ def each(work: Callable[[Run], Run], runs: list[Run], jobs: int) -> Iterable[Run
 
 
 def perform(one: Run) -> Run:
-    """Do a run; it leaves its report, and what it prints in `log.txt`."""
+    """Do a run and write its report; output goes to `log.txt`."""
     one.folder.mkdir(parents=True, exist_ok=True)
     with (one.folder / "log.txt").open("w") as log, redirect_stdout(log), redirect_stderr(log):
         described = reference(one) if one.policy in REFERENCES else trained(one)
@@ -143,38 +154,28 @@ def perform(one: Run) -> Run:
 
 def reference(one: Run) -> dict[str, Any]:
     """Evaluate the scripted controller or a random policy; returns its report."""
-    env = next(iter(HYPERPARAMETERS[one.task].values()))["env"]
-    policy = (
-        CONTROLLERS[one.task]()
-        if one.policy == "scripted"
-        else RandomPolicy(flatdim(gymnasium.make(env).action_space), one.seed)
-    )
-    return {"task": one.task, "algo": one.policy, "env": env, "seed": one.seed, **evaluated(one, policy, env)}
+    size = flatdim(gymnasium.make(one.env).action_space)
+    policy = controller_of(one.task) if one.policy == "scripted" else RandomPolicy(size, one.seed)
+    return {"task": one.task, "algo": one.policy, "env": one.env, "seed": one.seed, **evaluated(one, policy, one.env)}
 
 
 def trained(one: Run) -> dict[str, Any]:
     """Train as `python train.py` does and evaluate; returns the run's report."""
-    settings = dict(HYPERPARAMETERS[one.task][one.policy])
-    steps = max(1, int(settings["n_timesteps"] * (QUICK_SHARE if one.quick else 1.0)))
-    arguments = ["--task", one.task, "--algo", one.policy, "--seed", str(one.seed), "--steps", str(steps)]
-    options = train.parse([*arguments, "--out", str(one.folder)])
-    torch.set_num_threads(options.threads)
-    train.clear(one.folder)
-    model = train.build(one.policy, settings, options)
-    seconds, interrupted = train.train(model, one.task, one.policy, settings, options, one.folder, progress_bar=False)
+    job = Job(one.task, one.policy, settings_of(one.task)[one.policy], one.seed)
+    steps = max(1, int(job.settings["n_timesteps"] * (QUICK_SHARE if one.quick else 1.0)))
+    training.set_threads(job.threads)
+    training.clear(one.folder)
+    model = training.build(job)
+    seconds, interrupted = training.train(job, model, one.folder, steps, progress_bar=False)
     if interrupted:
         raise KeyboardInterrupt
-    model = train.load(one.folder / "policy.zip", one.policy, settings, options)
-    (one.folder / "replay_buffer.pkl").unlink(missing_ok=True)  # nobody goes on from here, and it is large
-    return {
-        **train.describe(model, one.task, one.policy, settings, options, seconds),
-        "steps": steps,
-        **evaluated(one, model, settings["env"]),
-    }
+    model = training.load(job, one.folder / "policy.zip")
+    (one.folder / "replay_buffer.pkl").unlink(missing_ok=True)  # nobody resumes it, and it is large
+    return {**training.describe(job, model, seconds), "steps": steps, **evaluated(one, model, job.settings["env"])}
 
 
 def evaluated(one: Run, policy: Policy, env: str) -> dict[str, Any]:
-    """Run a policy on its seed's held-out goals; returns what its report says of them."""
+    """Run a policy on its seed's held-out goals; returns that part of the report."""
     vector = gymnasium.make_vec(env, lanes_for(one.episodes), split="held-out")
     episodes = run(policy, vector, one.episodes, one.goals)
     ratio = over_fastest(episodes, least_times(one))
@@ -182,16 +183,16 @@ def evaluated(one: Run, policy: Policy, env: str) -> dict[str, Any]:
 
 
 def over_fastest(episodes: Episodes, least: Array) -> float | None:
-    """Return the time to success of the episodes that succeed over the `least` that heaters allow (n,); None if none does."""
+    """Return the ratio of the time to success to the `least` possible (n,), over successful episodes; None without any."""
     time = least[episodes.success].sum()
     return float(episodes.held_since_s[episodes.success].sum() / time) if time > 0.0 else None
 
 
 def least_times(one: Run) -> Array:
-    """Return `agents.fastest.fastest` of a run's held-out goals (n,) [s]; every policy has the same, so they are kept."""
-    path = one.out / "runs" / f"{one.task}-fastest-seed{one.seed}.json"
+    """Return `agents.fastest.fastest` of a run's held-out goals (n,) [s]; they are stored for all policies of the seed."""
+    path = one.out / "runs" / f"{one.entry.name}-fastest-seed{one.seed}.json"
     if not path.exists():
-        env = gymnasium.make(next(iter(HYPERPARAMETERS[one.task].values()))["env"], split="held-out")
+        env = gymnasium.make(one.env, split="held-out")
         found = [fastest(one.task, env.reset(seed=one.goals + i)[0]) for i in range(one.episodes)]
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(found) + "\n")
@@ -199,15 +200,16 @@ def least_times(one: Run) -> Array:
 
 
 def line(one: Run) -> str:
-    """Return what a run came to in one line."""
+    """Return the result of a run in one line."""
     found = held_out(one)
     seconds = json.loads(one.report.read_text()).get("training_seconds")
     time = "" if seconds is None else f", {seconds:.0f} s"
-    return f"{one.folder.name}: success {100.0 * found['success_rate']:.1f} %, {found['final_distance_mm']:.2f} mm{time}"
+    distance = "" if found["final_distance_mm"] is None else f", {found['final_distance_mm']:.2f} mm"
+    return f"{one.folder.name}: success {100.0 * found['success_rate']:.1f} %{distance}{time}"
 
 
 def held_out(one: Run) -> dict[str, Any]:
-    """Return what a run's report says of its held-out goals."""
+    """Return the results of a run on its held-out goals."""
     described: dict[str, Any] = json.loads(one.report.read_text())["held_out"][one.policy]
     return described
 
@@ -219,7 +221,7 @@ class Row:
     task: str
     policy: str
     default: bool
-    """Whether `python train.py` trains so."""
+    """Whether this is the task's default algorithm."""
     seeds: int
     episodes: int
     successes: int
@@ -228,19 +230,19 @@ class Row:
     """95 % Wilson score interval of the success rate."""
     final_distance_mm: float
     final_yaw_error_deg: float
-    """nan where the task has none."""
+    """nan, as the distance, where the task has none."""
     time_to_success_s: float
     over_fastest: float
-    """Time to success of the episodes that succeed over the least that heaters allow; nan, as the one before, if none does."""
+    """Ratio of the time to success to the least possible, over successful episodes; nan, as the time, without any."""
     energy_J: float
     minutes: float
-    """Of a training, mean over the seeds; nan if there is none."""
+    """Duration of a training, mean over the seeds; nan for references."""
     steps: int
-    """Of a training."""
+    """Of a training; 0 for references."""
 
 
 def rows(runs: list[Run]) -> list[Row]:
-    """Return the table of some runs, whose reports are there."""
+    """Return the table of finished runs."""
     table = []
     for task, policy in dict.fromkeys((one.task, one.policy) for one in runs):
         reports = [json.loads(one.report.read_text()) for one in runs if (one.task, one.policy) == (task, policy)]
@@ -255,7 +257,7 @@ def rows(runs: list[Run]) -> list[Row]:
             Row(
                 task,
                 policy,
-                DEFAULT_ALGORITHM[task] == policy,
+                default_algorithm(task) == policy,
                 len(reports),
                 episodes,
                 successes,
@@ -287,7 +289,7 @@ HEADER = (
 def cells(row: Row) -> list[str]:
     """Return a line of the table as text."""
     name = NAMES.get(row.policy, row.policy)
-    error = f"{row.final_distance_mm:.2f} mm"
+    error = number(row.final_distance_mm, "{:.2f} mm")
     if not np.isnan(row.final_yaw_error_deg):
         error += f", {row.final_yaw_error_deg:.1f}°"
     return [
@@ -308,7 +310,7 @@ def number(value: float, form: str) -> str:
 
 
 def write(out: Path, runs: list[Run], jobs: int) -> None:
-    """Write the tables and the figure of some runs, whose reports are there."""
+    """Write the tables and the figure of finished runs."""
     table = rows(runs)
     names = list(Row.__dataclass_fields__)
     write_csv(out / "benchmark.csv", names, [[getattr(row, name) for name in names] for row in table])
@@ -324,28 +326,28 @@ def write(out: Path, runs: list[Run], jobs: int) -> None:
 
 
 def page(table: list[Row], runs: list[Run], jobs: int) -> str:
-    """Return the page that shows the tables and the figure and says how they are measured."""
+    """Return the page with the tables, the figure and how they were measured."""
     seeds = list(dict.fromkeys(one.seed for one in runs))
     parts = [
         "# Trained policies",
         f"Made by `python train.py --benchmark`, {jobs} at a time on {os.cpu_count()} cores. Every algorithm was trained with "
-        f"seeds {', '.join(map(str, seeds))} and evaluated on {runs[0].episodes} held-out goals for each seed, the scripted "
-        "controller and a random policy on the same goals. In bold what `python train.py` trains by default.",
+        f"seeds {', '.join(map(str, seeds))} and evaluated on {runs[0].episodes} held-out goals for each seed. The scripted "
+        "controller and a random policy were evaluated on the same goals. Bold: the task's default algorithm.",
     ]
     for task in dict.fromkeys(row.task for row in table):
-        parts += [f"## {TITLES[task]}", markdown_table(HEADER, [cells(row) for row in table if row.task == task])]
+        parts += [f"## {registry.entry(task).title}", markdown_table(HEADER, [cells(row) for row in table if row.task == task])]
     parts += [
         "## Learning curves",
         "![Success against steps and time of training](curves.png)",
-        f"*Success on {train.CURVE_EPISODES} goals of the training split, mean and range over the seeds.*",
+        f"*Success on {training.CURVE_EPISODES} goals of the training split, mean and range over the seeds.*",
         "## How it is measured",
-        "An episode succeeds if its last step does: goals are to be held. Time to success is that from which on they are, mean "
-        "over the episodes that succeed; over the fastest: summed over them, and divided by the least time in which heaters "
-        "could do it, see `agents/fastest.py`. In PickAndPlace that leaves the stage and the release out, so nobody can come "
-        "near 1. The final error is the distance from the goal at the end of the episode, mean over all episodes, and in "
-        "TwistAlign that of the yaw. Training is the time of a whole training, the points of its learning curve included; the "
-        "policy kept is the one that came nearest to the goals of its curve.",
-        "`runs.csv` has the runs one by one, `curves.csv` the points of the curves.",
+        "An episode succeeds if its last step does: goals have to be held. Time to success is the time from which on the goal "
+        'is held, mean over successful episodes. "Over the fastest" is the sum of these times divided by the sum of the least '
+        "possible times, see `agents/fastest.py`. The least time of PickAndPlace leaves out stage and release, so no policy "
+        "comes near 1. The final error is the distance from the goal at the end of the episode, mean over all episodes; in "
+        "TwistAlign the yaw error, too. Training is the duration of a whole training with the points of its learning curve. "
+        "The policy kept is the one that came nearest to the goals of its curve.",
+        "`runs.csv` lists the runs, `curves.csv` the points of the curves.",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -370,7 +372,7 @@ def draw(out: Path) -> None:
             axes.set(xscale="log", ylim=(-3.0, 103.0))
             axes.grid(alpha=0.25, linewidth=0.6)
             axes.spines[["top", "right"]].set_visible(False)
-        panels[0, column].set(title=TITLES[task], xlabel="environment steps [thousands]")
+        panels[0, column].set(title=registry.entry(task).title, xlabel="environment steps [thousands]")
         panels[1, column].set(xlabel="time of training [min]")
         panels[0, column].legend(frameon=False, fontsize=8)
     for axes in panels[:, 0]:
@@ -379,7 +381,7 @@ def draw(out: Path) -> None:
 
 
 def spread(points: list[dict[str, str]], quantity: str) -> tuple[Array, Array, Array, Array]:
-    """Return values of `quantity` that all seeds have come to, and the least, mean and largest success rate at them."""
+    """Return values of `quantity` that all seeds have reached, and the least, mean and largest success rate there."""
     seeds = dict.fromkeys(point["seed"] for point in points)
     pairs = [(point["seed"], float(point[quantity]), float(point["success_rate"])) for point in points]
     curves = [np.array([pair[1:] for pair in pairs if pair[0] == seed]).T for seed in seeds]

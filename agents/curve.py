@@ -1,8 +1,9 @@
-"""The learning curve of a run: evaluations on the way, and with each of them a checkpoint."""
+"""The learning curve of a run: evaluations during training, each with a checkpoint."""
 
 import csv
 import time
 from collections.abc import Callable
+from math import isnan, nan
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +16,24 @@ COLUMNS = ("steps", "seconds", "success_rate", "final_distance_mm", "episode_ret
 
 
 class Curve(BaseCallback):
-    """Evaluate now and then, keep the policy that did best, and save what it takes to go on.
+    """Evaluate at intervals, keep the best policy, and save what resuming needs.
 
-    A run that is killed can go on from the last point: files appear whole or not at all.
+    A run that is killed can be resumed from the last point: files are replaced atomically.
 
     Parameters
     ----------
     folder : pathlib.Path
-        Of the run: into it go `policy.zip` (the best), `last.zip` and `replay_buffer.pkl` (the latest), `curve.csv` and
-        `curve.png`.
+        Of the run: `policy.zip` (the best), `last.zip` and `replay_buffer.pkl` (the latest), `curve.csv` and `curve.png` are
+        written there.
     env : gymnasium.vector.VectorEnv
         See `agents.evaluate.evaluate`.
     episodes, seed : int
-        Of each point, see there. The policy that comes nearest to these goals is the best.
+        Of each point, see there. The policy that comes nearest to these goals is the best; of a task without a distance, that
+        with the largest return.
     interval : int
         Steps between points.
     resume : bool
-        Whether to go on with the curve in `folder`.
+        Whether to continue the curve in `folder`.
     """
 
     def __init__(
@@ -45,7 +47,7 @@ class Curve(BaseCallback):
 
     @property
     def seconds(self) -> float:
-        """Time that the training took so far, its resumed parts included."""
+        """Duration of the training so far, earlier parts of a resumed run included."""
         return time.monotonic() - self.begun
 
     def _on_training_start(self) -> None:
@@ -61,7 +63,7 @@ class Curve(BaseCallback):
         if not self.rows or self.rows[-1]["steps"] < self.num_timesteps:
             self.add_point()
         else:
-            self.save()  # the learner has learnt since
+            self.save()  # the model was updated after the last point
 
     def add_point(self) -> None:
         """Evaluate and save."""
@@ -70,19 +72,19 @@ class Curve(BaseCallback):
             "steps": self.num_timesteps,
             "seconds": round(self.seconds, 1),
             "success_rate": report.success_rate,
-            "final_distance_mm": report.final_distance_mm,
+            "final_distance_mm": nan if report.final_distance_mm is None else report.final_distance_mm,
             "episode_return": report.episode_return,
         }
         for name in COLUMNS[2:]:
             self.logger.record(f"eval/{name}", row[name])
         self.logger.dump(self.num_timesteps)
         self.rows.append(row)
-        if row is min(self.rows, key=lambda row: row["final_distance_mm"]):
+        if row is min(self.rows, key=shortfall):
             replace(self.folder / "policy.zip", self.model.save)
         self.save()
 
     def save(self) -> None:
-        """Save the learner as it is, and the curve."""
+        """Save the current model and the curve."""
         if hasattr(self.model, "save_replay_buffer"):
             replace(self.folder / "replay_buffer.pkl", self.model.save_replay_buffer)
         replace(self.folder / "last.zip", self.model.save)
@@ -98,8 +100,14 @@ class Curve(BaseCallback):
             writer.writerows(self.rows)
 
 
+def shortfall(row: dict[str, float]) -> float:
+    """Return what is the smaller, the better a point of the curve is."""
+    distance = row["final_distance_mm"]
+    return -row["episode_return"] if isnan(distance) else distance
+
+
 def replace(path: Path, save: Callable[[Path], Any]) -> None:
-    """Let `save` write a file and put it in the place of an older one in an instant."""
+    """Replace a file atomically by one that `save` writes."""
     written = path.with_name(f"new-{path.name}")
     save(written)
     written.replace(path)
@@ -115,7 +123,7 @@ def read(folder: Path) -> list[dict[str, float]]:
 
 
 def draw(rows: list[dict[str, float]], folder: Path, episodes: int) -> None:
-    """Draw a learning curve with so many episodes per point as curve.png."""
+    """Draw a learning curve as curve.png; `episodes` is the number per point."""
     import matplotlib
 
     matplotlib.use("Agg")

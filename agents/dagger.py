@@ -1,8 +1,8 @@
-"""DAgger: a policy learns what a scripted controller would do in the situations that the policy itself comes into.
+"""DAgger: a policy imitates a scripted controller in the states that the policy itself visits.
 
 S. Ross, G. Gordon and D. Bagnell, "A reduction of imitation learning and structured prediction to no-regret online learning",
-AISTATS 2011. The first rounds are driven by the controller, later ones by the policy; the controller's actions are recorded
-everywhere, and after every round the policy is fitted to all that has been recorded.
+AISTATS 2011. The controller acts in the first rounds, the policy in later ones. The controller's actions are recorded in all
+of them, and after every round the policy is fitted to the whole record.
 """
 
 import pickle
@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.type_aliases import MaybeCallback
 
-from agents.scripted import CONTROLLERS
+from agents.scripted import controller_of
+from tca_envs import registry
 
 EXPERT_STEPS = 30_000
-"""Steps that the controller drives before the policy takes over."""
+"""Steps in which the controller acts before the policy takes over."""
 Observations = dict[str, NDArray[np.float32]]
 
 
 class DAgger(PPO):
-    """PPO's networks, saved and loaded like PPO's, fitted to a scripted controller instead.
+    """The networks of PPO, saved and loaded like PPO's, fitted to a scripted controller.
 
     Parameters
     ----------
@@ -31,17 +32,17 @@ class DAgger(PPO):
         As of Stable-Baselines3's `PPO`; `n_steps` are the steps of each environment in a round, `n_epochs` the passes
         over the record after it.
     controller : str
-        Key of `agents.scripted.CONTROLLERS`; only a policy that learns no more can do without.
+        The task whose controller is imitated, see `tca_envs.registry.entry`; only a policy that learns no more needs none.
 
     Raises
     ------
     ValueError
-        If there is no such controller, or none to learn from.
+        If there is no such task or it has no controller, or if there is none to learn from.
     """
 
     def __init__(self, policy: Any, env: Any, controller: str | None = None, **options: Any) -> None:
-        if controller is not None and controller not in CONTROLLERS:
-            raise ValueError(f"controller = {controller!r}: expected one of {', '.join(map(repr, CONTROLLERS))}")
+        if controller is not None:
+            teacher(controller)
         self.controller = controller
         self.record: list[tuple[Observations, NDArray[np.float32]]] = []
         options["policy_kwargs"] = {"activation_fn": torch.nn.ReLU, **(options.get("policy_kwargs") or {})}
@@ -51,11 +52,11 @@ class DAgger(PPO):
         return [*super()._excluded_save_params(), "record"]
 
     def save_replay_buffer(self, path: Path) -> None:
-        """Save what has been recorded, so that a run can go on."""
+        """Save the record, which resuming needs."""
         Path(path).write_bytes(pickle.dumps(self.record))
 
     def load_replay_buffer(self, path: Path) -> None:
-        """Load what `save_replay_buffer` saved."""
+        """Load a record that `save_replay_buffer` saved."""
         self.record = pickle.loads(Path(path).read_bytes())
 
     def learn(
@@ -67,18 +68,16 @@ class DAgger(PPO):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> "DAgger":
-        """Run rounds until `total_timesteps` more steps are done; see `BaseAlgorithm.learn`."""
+        """Train for `total_timesteps` more steps; see `BaseAlgorithm.learn`."""
         total_timesteps, callbacks = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        if self.controller is None:
-            raise ValueError(f"controller = None: expected one of {', '.join(map(repr, CONTROLLERS))} to learn from")
         assert self.env is not None
-        expert = CONTROLLERS[self.controller]()
+        expert = teacher(self.controller)
         callbacks.on_training_start(locals(), globals())
         observation: Any = self._last_obs
-        going_on = True
-        while going_on and self.num_timesteps < total_timesteps:
+        running = True
+        while running and self.num_timesteps < total_timesteps:
             by_expert = self.num_timesteps < EXPERT_STEPS
             for _ in range(self.n_steps):
                 wanted, _ = expert.predict(observation)
@@ -88,8 +87,8 @@ class DAgger(PPO):
                 self._update_info_buffer(infos, dones)
                 self._last_obs = observation
                 self.num_timesteps += self.env.num_envs
-                going_on = callbacks.on_step()
-                if not going_on or self.num_timesteps >= total_timesteps:
+                running = callbacks.on_step()
+                if not running or self.num_timesteps >= total_timesteps:
                     break
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
             self._fit()
@@ -115,3 +114,11 @@ class DAgger(PPO):
                 self.policy.optimizer.step()
         self.policy.set_training_mode(False)
         self.logger.record("train/loss", loss.item())
+
+
+def teacher(task: str | None) -> Any:
+    """Return the controller of a task; ValueError if there is none."""
+    known = [entry.name for entry in registry.entries() if entry.controller is not None]
+    if task is None or (":" not in task and task not in known) or (found := controller_of(task)) is None:
+        raise ValueError(f"controller = {task!r}: expected one of {', '.join(map(repr, known))} to learn from")
+    return found

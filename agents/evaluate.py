@@ -17,7 +17,7 @@ MOST_LANES = 250
 
 
 class Policy(Protocol):
-    """What is evaluated: an SB3 model or a scripted controller."""
+    """What can be evaluated: an SB3 model or a scripted controller."""
 
     def predict(self, observation: Any, state: Any = ..., episode_start: Any = ..., deterministic: bool = ...) -> Any:
         """Return (actions, state)."""
@@ -25,14 +25,14 @@ class Policy(Protocol):
 
 @dataclass(frozen=True)
 class Episodes:
-    """What became of n episodes. One succeeds if its last step does, by a converged solve: the goal must be held."""
+    """Results of n episodes. One succeeds if its last step does and the solver converged: the goal must be held."""
 
     success: NDArray[np.bool_]
     """(n,)"""
     held_since_s: NDArray[np.float64]
-    """(n,) time from which on the goal is held; without meaning for episodes that fail [s]."""
+    """(n,) time from which on the goal is held [s]; meaningless for failed episodes."""
     distance_mm: NDArray[np.float64]
-    """(n,) at the end."""
+    """(n,) at the end, nan where the task has none."""
     yaw_error_deg: NDArray[np.float64]
     """(n,) at the end, nan where the task has none."""
     energy_J: NDArray[np.float64]
@@ -40,7 +40,7 @@ class Episodes:
     total: NDArray[np.float64]
     """(n,) sum of the rewards."""
     converged: NDArray[np.bool_]
-    """(n,) False for those that the solver truncated."""
+    """(n,) False where the solver failed, which truncates the episode."""
 
 
 @dataclass(frozen=True)
@@ -52,26 +52,27 @@ class Report:
     success_rate: float
     success_interval: tuple[float, float]
     """95 % Wilson score interval of the success rate."""
-    final_distance_mm: float
-    """Mean over episodes."""
+    final_distance_mm: float | None
+    """Mean over episodes; None where the task has none."""
     final_yaw_error_deg: float | None
     """Mean over episodes; None where the task has none."""
     time_to_success_s: float | None
-    """Mean, over the episodes that succeed, of the time from which on the goal is held; None if none does."""
+    """Time from which on the goal is held, mean over successful episodes; None without any."""
     energy_J: float
     """Mean electrical energy of an episode."""
     episode_return: float
     """Mean."""
     solver_failures: int
-    """Episodes that the solver truncated."""
+    """Episodes that were truncated because the solver failed."""
 
     def __str__(self) -> str:
         low, high = self.success_interval
         time = "  --  " if self.time_to_success_s is None else f"{self.time_to_success_s:4.2f} s"
+        distance = "" if self.final_distance_mm is None else f"final distance {self.final_distance_mm:.2f} mm, "
         yaw = "" if self.final_yaw_error_deg is None else f"yaw error {self.final_yaw_error_deg:.2f} deg, "
         return (
             f"success {100 * self.success_rate:5.1f} % (95 % interval {100 * low:.1f}-{100 * high:.1f} %), "
-            f"final distance {self.final_distance_mm:.2f} mm, {yaw}time to success {time}, energy {self.energy_J:.1f} J"
+            f"{distance}{yaw}time to success {time}, energy {self.energy_J:.1f} J"
         )
 
 
@@ -87,7 +88,7 @@ def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, flo
 
 
 def lanes_for(episodes: int) -> int:
-    """Return how many lanes run `episodes` in as few rounds as MOST_LANES allows, with as few idle ones."""
+    """Return how many lanes run `episodes` in the fewest rounds that MOST_LANES allows, with the fewest idle lanes."""
     rounds = -(-episodes // MOST_LANES)
     return -(-episodes // rounds)
 
@@ -99,7 +100,7 @@ def evaluate(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Report:
-    """Run a policy and sum up its episodes; parameters as of `run`."""
+    """Run a policy and summarise its episodes; parameters as of `run`."""
     return summary(run(policy, env, episodes, seed, progress))
 
 
@@ -117,10 +118,10 @@ def run(
     policy : Policy
         Has `predict(observation, deterministic=True)`, for a batch of observations.
     env : gymnasium.vector.VectorEnv or gymnasium.Env
-        Environments with their time limit, in the autoreset mode NEXT_STEP, `gymnasium.make_vec`'s own; a single one is a batch
-        of one.
+        Environments with a time limit, in the autoreset mode NEXT_STEP, the default of `gymnasium.make_vec`; a single one is
+        a batch of one.
     episodes : int
-        How many; episode i is seeded with `seed` + i, so that every policy meets the same goals, whatever the batch.
+        How many; episode i is seeded with `seed` + i, so that every policy gets the same goals, whatever the batch.
     seed : int
         First seed.
     progress : callable, optional
@@ -133,7 +134,7 @@ def run(
     Raises
     ------
     ValueError
-        If `episodes` is not a positive integer or the environments restart in another way.
+        If `episodes` is not a positive integer or the environments have another autoreset mode.
     """
     if not isinstance(episodes, int) or episodes < 1:
         raise ValueError(f"episodes = {episodes!r}: expected a positive integer")
@@ -146,8 +147,8 @@ def run(
     held = np.zeros(episodes, dtype=bool)
     converged = np.zeros(episodes, dtype=bool)
     held_since = np.zeros(episodes, dtype=int)
-    distance, energy, total = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
-    yaw = np.full(episodes, np.nan)
+    energy, total = np.zeros(episodes), np.zeros(episodes)
+    distance, yaw = np.full(episodes, np.nan), np.full(episodes, np.nan)
     done = 0
     for first in range(0, episodes, lanes):
         seeds = [seed + first + lane for lane in range(lanes)]
@@ -164,26 +165,32 @@ def run(
             ended, running = running[over], running[~over]
             held[first + ended] = info["is_success"][ended]
             converged[first + ended] = info["solver"]["converged"][ended]
-            distance[first + ended] = info["distance_mm"][ended]
             energy[first + ended] = info["energy_J"][ended]
-            if "yaw_error_deg" in info:
-                yaw[first + ended] = info["yaw_error_deg"][ended]
+            for name, values in (("distance_mm", distance), ("yaw_error_deg", yaw)):
+                if name in info:
+                    values[first + ended] = info[name][ended]
             done += ended.size
             if progress is not None and ended.size:
                 progress(done)
-    return Episodes(held & converged, held_since * STEP_S, distance, yaw, energy, total, converged)
+    return Episodes(held & converged, held_since * step_duration(env), distance, yaw, energy, total, converged)
+
+
+def step_duration(env: VectorEnv[Any, Any, Any]) -> float:
+    """Return the duration of a step of environments [s]; STEP_S if they have no task that tells it."""
+    one = env.envs[0] if isinstance(env, SyncVectorEnv) else env
+    return float(getattr(getattr(one.unwrapped, "task", None), "step_s", STEP_S))
 
 
 def summary(episodes: Episodes) -> Report:
-    """Sum up n episodes, at least one."""
+    """Summarise n episodes, at least one."""
     success = episodes.success
-    yaw = float(episodes.yaw_error_deg.mean())
+    distance, yaw = float(episodes.distance_mm.mean()), float(episodes.yaw_error_deg.mean())
     return Report(
         episodes=success.size,
         successes=int(success.sum()),
         success_rate=float(success.mean()),
         success_interval=wilson(int(success.sum()), success.size),
-        final_distance_mm=float(episodes.distance_mm.mean()),
+        final_distance_mm=None if isnan(distance) else distance,
         final_yaw_error_deg=None if isnan(yaw) else yaw,
         time_to_success_s=float(episodes.held_since_s[success].mean()) if success.any() else None,
         energy_J=float(episodes.energy_J.mean()),

@@ -1,4 +1,4 @@
-"""What learns: policies of Stable-Baselines3 whose networks are shown `agents.features.Features`, and learners by name."""
+"""Policies of Stable-Baselines3 whose networks get `agents.features.Features`, and learners by name."""
 
 from typing import Any
 
@@ -9,21 +9,21 @@ from agents.features import Features
 
 
 class ActorCritic(MultiInputActorCriticPolicy):
-    """Of PPO and DAgger."""
+    """The policy of PPO and DAgger."""
 
     def __init__(self, *spaces: Any, **options: Any) -> None:
         super().__init__(*spaces, **{"features_extractor_class": Features, **options})
 
 
 class SoftActorCritic(MultiInputPolicy):
-    """Of SAC."""
+    """The policy of SAC."""
 
     def __init__(self, *spaces: Any, **options: Any) -> None:
         super().__init__(*spaces, **{"features_extractor_class": Features, **options})
 
 
 def learner(algorithm: str) -> Any:
-    """Return the class of an algorithm: Stable-Baselines3's, or our own in its form. HER is SAC with another buffer."""
+    """Return the class of an algorithm: Stable-Baselines3's or one with its interface. HER is SAC with another buffer."""
     import stable_baselines3
 
     from agents.dagger import DAgger

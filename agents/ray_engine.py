@@ -1,8 +1,8 @@
-"""PPO whose steps are made by workers on several cores or machines and whose updates Ray RLlib makes.
+"""PPO with workers on several cores or machines, by Ray RLlib.
 
-A worker steps one native batch of environments and sends whole stretches of episodes; the learner, one process, updates the
-networks of Stable-Baselines3's PPO and sends them back. What is learnt is saved as Stable-Baselines3's PPO saves it, so that
-evaluating it needs no Ray.
+A worker steps one native batch of environments and sends whole pieces of episodes. The learner, one process, updates the
+networks of Stable-Baselines3's PPO and sends them back. Models are saved as Stable-Baselines3's PPO saves them, so that
+evaluating them needs no Ray.
 """
 
 import logging
@@ -35,16 +35,15 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 import tca_envs  # noqa: F401  (registers the environments, in the workers' processes, too)
 
 SCHEDULE_POINTS = 20
-"""A learning rate that changes is handed to RLlib as a line through so many points."""
+"""RLlib gets a learning rate that changes as a piecewise linear function with so many pieces."""
 OBJECT_STORE_BYTES = 256 * 2**20
-"""Of a local cluster; a batch of half a million steps takes half of it."""
+"""Size of a local cluster's object store; a batch of half a million steps takes half of it."""
 
 
 class Networks(TorchRLModule, ValueFunctionAPI):
-    """The networks of a policy of Stable-Baselines3, in the form that RLlib wants.
+    """The networks of a policy of Stable-Baselines3 as a module of RLlib.
 
-    `model_config` has its class ("policy_class"), the arguments of that ("policy_kwargs") and the weights to start from
-    ("weights").
+    `model_config` has the policy's class ("policy_class"), its arguments ("policy_kwargs") and initial weights ("weights").
     """
 
     def setup(self) -> None:
@@ -64,10 +63,7 @@ class Networks(TorchRLModule, ValueFunctionAPI):
 
 
 class BatchRunner(SingleAgentEnvRunner):
-    """A worker: steps its environments as one batch and keeps arrays of whole steps.
-
-    RLlib's own goes through its environments one by one in Python, at every step.
-    """
+    """A worker that steps its environments as one batch; RLlib's own loops over them in Python at every step."""
 
     def make_env(self) -> None:
         """Make the batch of environments."""
@@ -87,7 +83,7 @@ class BatchRunner(SingleAgentEnvRunner):
         random_actions: bool = False,
         force_reset: bool = False,
     ) -> list[SingleAgentEpisode]:
-        """Step at least `num_timesteps` times; the other arguments are for uses of RLlib that do not occur here."""
+        """Step at least `num_timesteps` times; the other arguments are RLlib's and not used."""
         if self._needs_initial_reset:
             self._now, _ = self.env.reset(seed=self._seed)
             self._over = np.zeros(self.num_envs, dtype=bool)
@@ -114,13 +110,13 @@ class BatchRunner(SingleAgentEnvRunner):
 
 
 def cut(steps: list[Any], last: dict[str, NDArray[Any]]) -> list[SingleAgentEpisode]:
-    """Return the stretches of episodes in a record of a batch of N environments.
+    """Return the pieces of episodes in a record of a batch of N environments.
 
     Parameters
     ----------
     steps : list of tuple
-        At every step: observations before it, actions, rewards, terminated, truncated, whether it was a step at all rather
-        than the reset after the end of an episode (N,), what the networks said.
+        At every step: observations before it, actions, rewards, terminated, truncated, whether it was a step rather than the
+        reset after the end of an episode (N,), and outputs of the networks.
     last : dict
         Observations after the last step.
     """
@@ -155,12 +151,12 @@ class RayPPO(PPO):
     Parameters
     ----------
     policy, env, **options
-        As of Stable-Baselines3's `PPO`. `env` gives spaces and the number of environments, which the workers share out; it is
-        not stepped.
+        As of Stable-Baselines3's `PPO`. `env` gives the spaces and the number of environments, which the workers divide among
+        them; it is not stepped.
     env_id : str
         Id of the environments that the workers make.
     workers : int
-        How many processes step environments; on the `cluster` that `learn` is called in, or on this machine.
+        How many processes step environments, on the `cluster` in which `learn` is called or on this machine.
 
     Raises
     ------
@@ -176,10 +172,10 @@ class RayPPO(PPO):
                 raise ValueError(f"{name} = {getattr(self, name)!r}: expected {plain!r}, RLlib's PPO has no other")
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "workers"]  # where it ran is no part of what was learnt
+        return [*super()._excluded_save_params(), "workers"]  # belongs to the machine, not to the model
 
     def config(self, steps: int) -> PPOConfig:
-        """Return RLlib's form of the settings, for training of so many steps from where the model stands.
+        """Return the settings as RLlib's, to train the model for `steps` more steps.
 
         Raises
         ------
@@ -286,22 +282,22 @@ def optimizers(learner: Any) -> list[torch.optim.Optimizer]:
 
 @contextmanager
 def cluster(address: str | None, processors: int) -> Iterator[None]:
-    """Be connected to a Ray cluster; to be used in a `with` statement. Within another one it does nothing.
+    """Connect to a Ray cluster for a `with` statement; within another one it does nothing.
 
     Parameters
     ----------
     address : str, optional
-        HOST:PORT of a running cluster ("auto" for the one that this machine is part of); by default one is started on this
-        machine, and ended.
+        HOST:PORT of a running cluster, or "auto" for the one that this machine is part of; by default one is started on this
+        machine and stopped afterwards.
     processors : int
-        How many will be needed.
+        How many are needed.
 
     Raises
     ------
     ConnectionError
         If there is no cluster at the address.
     ValueError
-        If the cluster has fewer processors: Ray would wait for more for ever.
+        If the cluster has fewer processors, for which Ray would wait forever.
     """
     if ray.is_initialized():
         yield
@@ -328,7 +324,7 @@ def cluster(address: str | None, processors: int) -> Iterator[None]:
 
 
 class Progress(tune.Callback):
-    """Says of every trial that it is over."""
+    """Print a line after every trial."""
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **_: Any) -> None:
         """See `ray.tune.Callback`."""
@@ -336,22 +332,22 @@ class Progress(tune.Callback):
 
 
 def run_trials(trial: Callable[[Any], dict[str, Any]], settings: Sequence[Any], workers: int) -> list[dict[str, Any]]:
-    """Run a trial with each of some settings by Ray Tune, within `cluster`: as many at a time as that has processors for.
+    """Run a trial with each of some settings by Ray Tune, within `cluster`, as many at a time as that has processors for.
 
     Parameters
     ----------
     trial : callable
-        Trains with one of the settings and returns what came of it; runs in a process of its own on this machine, so that
-        what it writes lies here, while its workers run anywhere.
+        Trains with one of the settings and returns its results. It runs in a process of its own on this machine, where its
+        files belong; its workers run anywhere.
     settings : sequence
         One for each trial.
     workers : int
-        How many a trial has.
+        Of each trial.
 
     Returns
     -------
     list of dict
-        What the trials returned, in the order of the settings.
+        Results of the trials, in the order of the settings.
 
     Raises
     ------

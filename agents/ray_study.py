@@ -1,4 +1,4 @@
-"""What workers are worth: how fast PPO samples and learns with one process, and with one and two workers.
+"""Speed of workers: how fast PPO samples and learns in one process, and with one and two workers.
 
 python -m agents.ray_study --out docs/study
 """
@@ -18,19 +18,21 @@ from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
-from agents.hyperparameters import HYPERPARAMETERS, for_learner
+from agents.hyperparameters import for_learner, settings_of
+from agents.output import markdown_table, write_csv
 from agents.ray_engine import BatchRunner, RayPPO, cluster
 from agents.sb3 import make
-from tca_envs.study.output import markdown_table, write_csv
+from tca_envs import registry
 
+TASKS = [entry.name for entry in registry.entries()]
 WARM_UP = 2
-"""Updates that are not counted: processes start, kernels are loaded, the first episodes are all new."""
+"""Updates that are not counted, in which processes start and kernels are loaded."""
 UPDATES = 8
 
 
 @dataclass(frozen=True)
 class Rate:
-    """What one way of training does in a second."""
+    """Speed of one way of training."""
 
     task: str
     way: str
@@ -44,7 +46,7 @@ class Rate:
 
 
 class Clock:
-    """Adds up the time that a function takes."""
+    """A function whose calls are timed."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function, self.seconds = function, 0.0
@@ -59,8 +61,8 @@ class Clock:
 
 
 def measure_ray(task: str, way: str, workers: int, runner: type[EnvRunner]) -> Rate:
-    """Measure training by Ray with so many workers."""
-    settings = HYPERPARAMETERS[task]["ppo"]
+    """Measure training by Ray with `workers` workers."""
+    settings = settings_of(task)["ppo"]
     env = make(settings["env"], settings["n_envs"], 0)
     model = RayPPO(env=env, env_id=settings["env"], workers=workers, seed=0, **for_learner(settings))
     config = model.config(settings["n_timesteps"])
@@ -81,7 +83,7 @@ def measure_ray(task: str, way: str, workers: int, runner: type[EnvRunner]) -> R
 
 
 class Mark(BaseCallback):
-    """Note the time when the warm-up is over."""
+    """Note the time at the end of the warm-up."""
 
     begun = 0.0
 
@@ -95,7 +97,7 @@ class Mark(BaseCallback):
 
 def measure_one_process(task: str) -> Rate:
     """Measure training by Stable-Baselines3, whose batch of environments has all processors."""
-    settings = HYPERPARAMETERS[task]["ppo"]
+    settings = settings_of(task)["ppo"]
     model = PPO(env=make(settings["env"], settings["n_envs"], 0), seed=0, device="cpu", **for_learner(settings))
     clock = Clock(model.train)
     model.train = clock  # type: ignore[method-assign]
@@ -112,12 +114,12 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
-    rates = [measure_one_process(task) for task in HYPERPARAMETERS]
+    rates = [measure_one_process(task) for task in TASKS]
     with cluster(None, 2):
-        for task in HYPERPARAMETERS:
+        for task in TASKS:
             rates += [measure_ray(task, "ray", workers, BatchRunner) for workers in (1, 2)]
         rates.append(measure_ray("reach", "ray, RLlib's own worker", 1, SingleAgentEnvRunner))
-    rates.sort(key=lambda rate: list(HYPERPARAMETERS).index(rate.task))
+    rates.sort(key=lambda rate: TASKS.index(rate.task))
     write_csv(options.out / "workers.csv", [field.name for field in fields(Rate)], [astuple(rate) for rate in rates])
     (options.out / "workers.md").write_text(page(rates), encoding="utf-8")
 
@@ -125,7 +127,7 @@ def main(arguments: list[str] | None = None) -> None:
 def page(rates: list[Rate]) -> str:
     """Return the page of the results."""
     gains = []
-    for task in HYPERPARAMETERS:
+    for task in TASKS:
         one, two = (next(r for r in rates if (r.task, r.way, r.workers) == (task, "ray", n)) for n in (1, 2))
         gains.append(f"{two.sampling / one.sampling:.2f} times as fast in {task} ({two.overall / one.overall:.2f} in all)")
     rows = [

@@ -44,7 +44,7 @@ def make(name: str, lanes: int, seed: int | None = None, done_steps: int | None 
 
 
 class BatchVecEnv(VecEnv):
-    """N lanes of a Gymnasium `VectorEnv`, stepped as Stable-Baselines3 asks for it.
+    """N lanes of a Gymnasium `VectorEnv` with the interface of Stable-Baselines3.
 
     Observations, rewards, ends and infos are those that its `DummyVecEnv` gives for N single environments. A lane whose
     episode is over starts the next one in the same step; the last observation is in `info["terminal_observation"]`, and
@@ -55,12 +55,12 @@ class BatchVecEnv(VecEnv):
     env : gymnasium.vector.VectorEnv
         Its observations are dictionaries of arrays and its autoreset mode is DISABLED: this class resets.
     done_steps : int, optional
-        End episodes, as truncated, whose goal has been held for so many steps (`info["is_success"]`).
+        Truncate episodes whose goal has been held for this number of steps (`info["is_success"]`).
 
     Raises
     ------
     ValueError
-        If an argument is none of these.
+        If an argument has another type or value.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any], done_steps: int | None = None) -> None:
@@ -152,9 +152,9 @@ class BatchVecEnv(VecEnv):
 
 
 def by_lane(infos: dict[str, Any], lanes: NDArray[np.intp]) -> list[dict[str, Any]]:
-    """Return infos of single environments from a batch's, in which every `key` has a mask `_key` of the lanes that know it.
+    """Return infos of single environments from a batch's, where the mask `_key` tells which lanes have a `key`.
 
-    It is paid for every lane in every step: copies of a dictionary filled key by key are twice as fast as new ones.
+    It runs in every step: copies of a dictionary that are filled key by key are twice as fast as new ones.
     """
     names = [name for name in infos if f"_{name}" in infos]
     known = {name: infos[f"_{name}"][lanes] for name in names}

@@ -1,201 +1,186 @@
-"""Controllers that solve the tasks from their observations, with the arm's model and no learning.
+"""Controllers that solve the tasks from their observations, with the arm's model and without learning.
 
-They have the interface of a Stable-Baselines3 policy, `predict(observation) -> (action, None)` for one observation or a batch,
-so that everything that runs a trained policy runs them too.
+They have the interface of a Stable-Baselines3 policy, `predict(observation) -> (action, None)` for one observation or a batch.
+A plan is a set of temperatures, found by Gauss-Newton on the arm's model with `tip_jacobian`. The drive combines feed-forward
+and feedback: the power that takes the measured temperature to the next one in a step, all TCAs in pace.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs import presets
+from tca_envs import registry
 from tca_envs.mechanics import Arm, Equilibrium, grasp, thermal
-from tca_envs.mechanics.rotation import yaw_angle
-from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT, Heater
+from tca_envs.robots import Robot
+from tca_envs.rotation import yaw_angle
 from tca_envs.tasks import pick_and_place as layout
 from tca_envs.tasks import twist_align
-from tca_envs.tasks.core import STEP_S
+from tca_envs.tasks.pick_and_place import PickAndPlace
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Observation = dict[str, NDArray[Any]]
 
 Aim = Callable[[Equilibrium], tuple[Array, Array]]
-"""Equilibrium -> what is missing to the goal (k,) [m] and the derivative of what is there in the temperatures (k, n) [m/K]."""
+"""Equilibrium -> error: goal minus position (k,) [m], and the position's Jacobian in the temperatures (k, n) [m/K]."""
 
 CLOSE_ENOUGH = 5e-5
-"""Distance of the planned tip from the goal [m] at which planning ends: a twentieth of what Reach asks, less of the others'."""
-METRES_PER_RADIAN = twist_align.SUCCESS_CM / 100.0 / np.radians(twist_align.SUCCESS_DEG)
-"""Weight of yaw errors in plans: a tolerance of yaw counts like one of position."""
+"""Error of the planned tip [m] at which planning ends: a twentieth of Reach's success radius."""
+METRES_PER_RADIAN = twist_align.SUCCESS_MM / 10.0 / 100.0 / np.radians(twist_align.SUCCESS_DEG)
+"""Weight of yaw errors in plans: TwistAlign's tolerance of yaw counts like that of position."""
 MOST_YAW = np.radians(60.0)
-"""Yaws are counted from here down a full turn: heating the helix turns one way, by at most 250 degrees or so."""
+"""Yaws are counted from here down a full turn: heating the helix turns the arm one way, by at most about 250 degrees."""
 
-OPEN, WIDE = 150.0, 4.5e-3
-"""Temperature of the open gripper [degC], and the gap from which on it counts as open [m]."""
+WIDE = 4.5e-3
+"""Gap of the jaws [m] from which on the gripper counts as open."""
 NEAR, NEAR_YAW = 3e-3, np.radians(20.0)
 """Errors of the tool [m], [rad] at which the gripper opens."""
 MARGIN, ALONG = 4e-4, 2.5e-3
-"""Spare gap of the jaws, and the largest offset of the object along their width [m]."""
+"""Clearance of the object between the jaws, and its largest offset along their width [m]."""
 GRASP_DEPTH = 1.5e-3
-"""The jaws close when they are no higher above the object's centre [m]."""
+"""Height above the object's centre [m] below which the jaws close."""
 OVER_TARGET, PLACED = 1.5e-3, 2.8e-3
-"""Errors of the object [m] at which it is released, and at which it is left."""
+"""Errors of the object [m] below which it is released, and below which it counts as placed."""
 UNTWISTED = np.radians(15.0)
-"""Yaw of the tool [rad] that counts as the original one."""
+"""Yaw of the tool [rad] below which it counts as untwisted."""
 SAME_PLACE = 2e-4
-"""An object that moved less [m], turned less [rad], needs no new plan."""
+"""Change of place [m] and yaw [rad] of the object up to which a plan stays valid."""
 LEAST_TURN = np.radians(5.0)
-"""Of the yaws that fit, the first below this one needs the least heat [rad]."""
+"""Of the yaws that fit the object, the first below this one needs the least heat [rad]."""
+LUKEWARM, HOT = 60.0, 120.0
+"""Temperatures of bending TCAs from which plans begin [degC]."""
 
 
-class Lanes:
-    """A controller for each lane of a batch: what one remembers is none of another's business.
-
-    Parameters
-    ----------
-    controller : callable
-        Makes one.
-    """
-
-    def __init__(self, controller: "Callable[[], SteadyController | PickAndPlaceController]") -> None:
-        self.controller = controller
-        self.lanes: list[SteadyController | PickAndPlaceController] = []
-
-    def predict(self, observation: dict[str, NDArray[Any]]) -> tuple[NDArray[np.float32], None]:
-        """Return the actions (N, n) for a batch of observations."""
-        while len(self.lanes) < len(observation["desired_goal"]):
-            self.lanes.append(self.controller())
-        rows = [{key: value[i] for key, value in observation.items()} for i in range(len(observation["desired_goal"]))]
-        return np.array([lane.predict(row)[0] for lane, row in zip(self.lanes, rows, strict=False)]), None
-
-
-class SteadyController(ABC):
-    """Plan the temperatures that put the tip on the goal, then drive each TCA there.
-
-    The plan is Gauss-Newton on the arm's model with `tip_jacobian`, anew for every new goal. The drive is feed-forward
-    and feedback in one: the power that takes the measured temperature to the next one in a step, all TCAs keeping pace.
+class Controller(ABC):
+    """What the controllers share: the interface of a policy, and a plan for the arm's steady state that is driven to.
 
     Parameters
     ----------
-    arm : Arm
-        The arm that the task steps.
+    task : Task, optional
+        The task, with any robot; by default the registered one.
     """
 
-    def __init__(self, arm: Arm) -> None:
-        self.arm = arm
-        self.heating = Heater().scaled(self.arm.rest_lengths)
+    name: ClassVar[str]
+    """Of the registered task."""
+
+    def __init__(self, task: Any = None) -> None:
+        self.task = registry.entry(self.name).new() if task is None else task
+        self.robot: Robot = self.task.robot
+        self.heating = self.robot.heating()
         self.goal: Array | None = None
-        self.target = np.full(len(self.arm.muscles), AMBIENT)
-        self.lanes = Lanes(type(self))
+        self.target = np.full(self.robot.heated, self.robot.limits.ambient)
+        self.lanes: list[Controller] = []
 
     def predict(
-        self,
-        observation: dict[str, NDArray[Any]],
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
+        self, observation: Observation, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[NDArray[np.float32], None]:
-        """Return the action (n,) for an observation of the task, or actions (N, n) for a batch of N.
+        """Return the action (a,) for an observation of the task, or actions (N, a) for a batch of N.
 
-        Lane i of a batch remembers what it planned for lane i; the other arguments are SB3's and not read.
+        Each lane of a batch has a controller of its own, which remembers its plans; the other arguments are SB3's and not read.
         """
-        if np.ndim(observation["desired_goal"]) == 2:
-            return self.lanes.predict(observation)
-        goal = np.asarray(observation["desired_goal"], dtype=np.float64)
-        if self.goal is None or not np.array_equal(goal, self.goal):
-            self.goal, self.target = goal, self.plan(goal)
-        count = len(self.target)
-        temperature = AMBIENT + (SOFT_LIMIT - AMBIENT) * np.asarray(observation["observation"][:count], dtype=np.float64)
-        return drive(temperature, self.target, self.heating).astype(np.float32), None
+        if np.ndim(observation["desired_goal"]) == 1:
+            return self.act(observation).astype(np.float32), None
+        rows = [{key: value[i] for key, value in observation.items()} for i in range(len(observation["desired_goal"]))]
+        self.lanes += [type(self)(self.task) for _ in rows[len(self.lanes) :]]
+        return np.array([lane.act(row) for lane, row in zip(self.lanes, rows, strict=False)], dtype=np.float32), None
 
     @abstractmethod
+    def act(self, observation: Observation) -> Array:
+        """Return the action (a,) for an observation."""
+
+    def hold(self, observation: Observation, plan: Callable[[Array], Array]) -> Array:
+        """Return the action that heats towards the goal and holds it; `plan` gives the arm's temperatures for a new goal."""
+        goal = np.asarray(observation["desired_goal"], dtype=np.float64)
+        if self.goal is None or not np.array_equal(goal, self.goal):
+            self.goal, planned = goal, plan(goal)
+            self.target = np.append(planned, self.target[planned.size :])
+        return drive(measured(self.robot, observation), self.target, self.heating, self.task.step_s)
+
+
+class ReachController(Controller):
+    """Solves TCAReach: the steady state of a plan puts the tip on the goal."""
+
+    name = "reach"
+
+    def act(self, observation: Observation) -> Array:
+        """Return the action (n,) for an observation."""
+        return self.hold(observation, self.plan)
+
     def plan(self, goal: Array) -> Array:
-        """Return the temperatures (n,) [degC] whose steady state is the goal, in the units of the task."""
+        """Return temperatures (n,) [degC] that bring the tip to `goal` (3,) [cm]."""
+        return plan(self.robot, tip_at(goal / 100.0), starts(self.robot))
 
 
-class ReachController(SteadyController):
-    """Solves TCAReach."""
+class TwistAlignController(Controller):
+    """Solves TCATwistAlign: the steady state of a plan puts the tip on the goal and turns it."""
 
-    def __init__(self) -> None:
-        super().__init__(presets.bending_arm())
+    name = "twist-align"
 
-    def plan(self, goal: Array) -> Array:
-        """Return temperatures (3,) [degC] that bring the tip to `goal` (3,) [cm]."""
-        return plan(self.arm, tip_at(goal / 100.0), BENDING_STARTS)
-
-
-class TwistAlignController(SteadyController):
-    """Solves TCATwistAlign."""
-
-    def __init__(self) -> None:
-        super().__init__(presets.whole_arm())
+    def act(self, observation: Observation) -> Array:
+        """Return the action (n,) for an observation."""
+        return self.hold(observation, self.plan)
 
     def plan(self, goal: Array) -> Array:
-        """Return temperatures (4,) [degC] that bring the tip to `goal` (5,): x, y, z [cm], cosine and sine of the yaw."""
+        """Return temperatures (n,) [degC] that bring the tip to `goal` (5,): x, y, z [cm], cosine and sine of the yaw."""
         turn = unwrapped(float(np.arctan2(goal[4], goal[3])))
-        return plan(self.arm, tip_and_yaw_at(goal[:3] / 100.0, turn), twisted(self.arm, turn))
+        return plan(self.robot, tip_and_yaw_at(goal[:3] / 100.0, turn), starts(self.robot, turn))
 
 
-class PickAndPlaceController:
+class PickAndPlaceController(Controller):
     """Solves TCAPickAndPlace: the sequence of the paper's Fig. 6 as a state machine.
 
-    The state is read off the observation at every step, so that a slip or a missed grasp leads back to where it belongs:
+    The state is read from the observation at every step, so that the controller recovers from a slip or a missed grasp:
 
     1. `align`: bend and twist until the tool is over the object with its yaw;
-    2. `open`: heat the gripper, from when the tool is near;
-    3. `lower`: as long as the object fits between the jaws, until they are around its middle;
+    2. `open`: heat the gripper as soon as the tool is near;
+    3. `lower`: while the object fits between the jaws, until they are around its middle;
     4. `close`: let the gripper cool until friction holds the object;
     5. `lift`: the stage up;
     6. `untwist`: the helix cools;
     7. `carry`: bend until the object is over the target;
     8. `release`: heat the gripper until the object falls;
-    9. `leave`: open jaws go up, everything cools.
+    9. `leave`: raise the open jaws, let everything cool.
 
-    Plans are Gauss-Newton on the arm's model, anew where the object or the target has moved.
+    A plan is made again whenever the object or the target has moved.
     """
 
-    def __init__(self) -> None:
-        self.arm = presets.whole_arm()
-        self.carrying = presets.whole_arm(payload=presets.with_object())
-        self.heating = Heater().scaled(np.append(self.arm.rest_lengths, presets.gripper().rest_length))
+    name = "pick-and-place"
+
+    def __init__(self, task: PickAndPlace | None = None) -> None:
+        super().__init__(task)
         self.plans: dict[str, tuple[Array, Array]] = {}
-        self.lanes = Lanes(type(self))
 
-    def predict(
-        self,
-        observation: dict[str, NDArray[Any]],
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], None]:
-        """Return the action (6,) for an observation of TCAPickAndPlace, or actions (N, 6) for a batch of N.
-
-        Lane i of a batch remembers what it planned for lane i; the other arguments are SB3's and not read.
-        """
-        if np.ndim(observation["desired_goal"]) == 2:
-            return self.lanes.predict(observation)
-        scene = Sight.of(observation)
+    def act(self, observation: Observation) -> Array:
+        """Return the action (m + 1,) for an observation."""
+        scene = Sight.of(observation, self.task)
         phase = self.phase(scene)
-        temperature = scene.temperature
+        temperature, limits = scene.temperature, self.robot.limits
+        arm = slice(temperature.size - 1)
         if phase in ("carry", "release"):
             bent = self._plan("target", scene.target)
         elif phase == "untwist":
-            bent = np.append(temperature[:3], AMBIENT)
+            bent = np.where(helical(self.robot.arm), limits.ambient, temperature[arm])
         elif phase in ("close", "lift") or (phase == "leave" and scene.low):
-            bent = temperature[:4]  # the arm stays where it is
+            bent = temperature[arm]  # the arm stays where it is
         elif phase == "leave":
-            bent = np.full(4, AMBIENT)
+            bent = np.full(temperature.size - 1, limits.ambient)
         else:
             bent = self._plan("object", np.append(scene.object[:2], scene.object_yaw))
         hot = phase in ("open", "lower", "release") or (phase == "align" and scene.near) or (phase == "leave" and scene.low)
-        jaws = OPEN if hot else AMBIENT
+        jaws = np.array([limits.soft if hot else limits.ambient])
         down = {"lower": 1.0, "open": 0.0, "close": 0.0, "release": 0.0, "align": -1.0 if scene.low else 0.0}
         speed = down.get(phase, -1.0)
-        bending, opening = self.heating.part(slice(4)), self.heating.part(slice(4, 5))
-        action = [*drive(temperature[:4], bent, bending), *drive(temperature[4:], np.array([jaws]), opening), speed]
-        return np.array(action, dtype=np.float32), None
+        gripper = slice(temperature.size - 1, temperature.size)
+        powers = [
+            drive(temperature[part], target, self.heating.part(part), self.task.step_s)
+            for part, target in ((arm, bent), (gripper, jaws))
+        ]
+        return np.concatenate([*powers, [speed]])
 
     def phase(self, scene: "Sight") -> str:
         """Return the name of the phase that an observation belongs to."""
@@ -216,20 +201,21 @@ class PickAndPlaceController:
         return "lower" if scene.fits and (scene.between or not scene.low) else "align"
 
     def _plan(self, name: str, goal: Array) -> Array:
-        """Return the temperatures (4,) [degC] that bring the tool to `goal`: x, y [m] and perhaps a yaw [rad] modulo pi."""
+        """Return the temperatures (n,) [degC] that bring the tool to `goal`: x, y [m] and perhaps a yaw [rad] modulo pi."""
         known, temperatures = self.plans.get(name, (None, None))
         if known is None or temperatures is None or np.abs(goal - known).max() > SAME_PLACE:
-            arm = self.carrying if name == "target" else self.arm
-            turn = LEAST_TURN - (LEAST_TURN - goal[2]) % np.pi if len(goal) == 3 else None
-            temperatures = plan(arm, tool_at(goal[:2], turn), twisted(arm, turn))
+            robot = carrying(self.robot) if name == "target" else self.robot
+            turn = least_turn(goal[2]) if len(goal) == 3 else None
+            temperatures = plan(robot, tool_at(robot, goal[:2], turn), starts(robot, turn))
             self.plans[name] = goal, temperatures
         return temperatures
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What a controller sees in an observation of TCAPickAndPlace, in SI units and degC."""
+    """The contents of an observation of TCAPickAndPlace in SI units and degC."""
 
+    task: PickAndPlace
     temperature: Array
     tool: Array
     yaw: float
@@ -258,13 +244,13 @@ class Sight:
     @property
     def between(self) -> bool:
         """Whether the object stands between the jaws."""
-        return self.low and self.touched and self._offsets()[1] <= 0.5 * presets.SITE.jaw_width
+        return self.low and self.touched and self._offsets()[1] <= 0.5 * self.task.site.jaw_width
 
     @property
     def fits(self) -> bool:
         """Whether the object as it lies to the jaws fits between them."""
         across, along = self._offsets()
-        reach = float(grasp.half_extents(np.array(self.turn), presets.OBJECT)[0])
+        reach = float(grasp.half_extents(np.array(self.turn), self.task.box)[0])
         return 2.0 * (reach + across) + MARGIN < self.gap and along < ALONG
 
     def _offsets(self) -> tuple[float, float]:
@@ -273,15 +259,16 @@ class Sight:
         return float(abs(c * x + s * y)), float(abs(c * y - s * x))
 
     @classmethod
-    def of(cls, observation: dict[str, NDArray[Any]]) -> "Sight":
-        """Return what `observation` says."""
+    def of(cls, observation: Observation, task: PickAndPlace) -> "Sight":
+        """Return the contents of an observation of `task`."""
         seen = np.asarray(observation["observation"], dtype=np.float64)
         place, tool = seen[layout.OBJECT] / 100.0, seen[layout.TOOL] / 100.0
         force = np.array(layout.FULL_FORCE * seen[layout.FORCE])
-        held = bool(grasp.holds(force, presets.OBJECT, presets.SITE))
-        low = bool(tool[2] > place[2] - 0.5 * presets.OBJECT.height)
+        held = bool(grasp.holds(force, task.box, task.site))
+        low = bool(tool[2] > place[2] - 0.5 * task.box.height)
         return cls(
-            temperature=AMBIENT + (SOFT_LIMIT - AMBIENT) * seen[layout.TEMPERATURES],
+            task=task,
+            temperature=measured(task.robot, observation),
             tool=tool,
             yaw=float(np.arctan2(seen[layout.TOOL_SIN], seen[layout.TOOL_COS])),
             stage=float(seen[layout.TRAVEL]),
@@ -295,21 +282,34 @@ class Sight:
         )
 
 
-def drive(temperature: Array, target: Array, heating: thermal.Heating) -> Array:
-    """Return the action (n,) that takes TCAs from `temperature` towards `target` (n,) [degC], on the straight way from ambient.
+def measured(robot: Robot, observation: Observation) -> Array:
+    """Return the temperatures (m,) [degC] of the heated TCAs in an observation."""
+    limits, scaled = robot.limits, np.asarray(observation["observation"][: robot.heated], dtype=np.float64)
+    return limits.ambient + (limits.soft - limits.ambient) * scaled
 
-    The TCA that needs longest sets the pace, so nothing is lost, and the arm comes to the equilibrium that slow heating
-    leads to: with one TCA near 150 degC it has others, buckled to the other side.
+
+def drive(temperature: Array, target: Array, heating: thermal.Heating, step_s: float) -> Array:
+    """Return the action (n,) that takes TCAs from `temperature` towards `target` (n,) [degC], all in the same proportion.
+
+    The TCA that needs longest sets the pace, which costs no time. So the arm reaches the equilibrium of slow heating: with one
+    TCA near 150 degC it has others, buckled to the other side.
     """
-    rise = target - AMBIENT
-    reachable = thermal.step(temperature, heating.max_power, STEP_S, heating) - AMBIENT
+    rise = target - heating.ambient
+    reachable = thermal.step(temperature, heating.max_power, step_s, heating) - heating.ambient
     share = min([1.0, *(reachable[rise > 0.0] / rise[rise > 0.0])])
-    power = thermal.power_to_reach(temperature, AMBIENT + share * rise, STEP_S, heating)
+    power = thermal.power_to_reach(temperature, heating.ambient + share * rise, step_s, heating)
     return 2.0 * np.clip(power / heating.max_power, 0.0, 1.0) - 1.0
 
 
-BENDING_STARTS = np.vstack([np.full(3, 60.0), 60.0 + 60.0 * np.eye(3), 120.0 - 60.0 * np.eye(3)])
-"""Where plans begin [degC]: all bending TCAs lukewarm, then each one hot, then each one cooler than the others."""
+@lru_cache(maxsize=16)
+def carrying(robot: Robot) -> Robot:
+    """Return a robot with what it carries at its tip."""
+    return replace(robot, arm=Arm(robot.arm.modules, robot.arm.gravity, robot.carries))
+
+
+def helical(arm: Arm) -> Mask:
+    """Return which TCAs of an arm (n,) are wound around it and twist it; the others bend it."""
+    return np.array([muscle.turns != 0.0 for muscle in arm.muscles])
 
 
 def tip_at(goal: Array) -> Aim:
@@ -328,16 +328,18 @@ def tip_and_yaw_at(goal: Array, turn: float) -> Aim:
     return aim
 
 
-def tool_at(goal: Array, turn: float | None) -> Aim:
-    """Return the aim of a horizontal place of the tool (2,) [m] and a yaw [rad]; without one the helix stays as it is."""
+def tool_at(robot: Robot, goal: Array, turn: float | None) -> Aim:
+    """Return the aim of a horizontal position of the tool (2,) [m] and a yaw [rad]; without a yaw the helix is not heated."""
+    assert robot.gripper is not None
+    depth, twists = robot.gripper.depth, helical(robot.arm)
 
     def aim(here: Equilibrium) -> tuple[Array, Array]:
         pose, jacobian = here.tip_pose, here.tip_jacobian
-        lever = presets.JAW_DEPTH * pose[:3, 2]
+        lever = depth * pose[:3, 2]
         place = jacobian[:3] + np.cross(jacobian[3:], lever, axis=0)
         missing = goal - (pose[:3, 3] + lever)[:2]
         if turn is None:
-            place[:, -1] = 0.0
+            place[:, twists] = 0.0
             return missing, place[:2]
         yaws = METRES_PER_RADIAN * yaw_gradient(pose) @ jacobian[3:]
         return np.append(missing, METRES_PER_RADIAN * (turn - yaw_of(here))), np.vstack([place[:2], yaws])
@@ -348,6 +350,11 @@ def tool_at(goal: Array, turn: float | None) -> Aim:
 def unwrapped(angle: float) -> float:
     """Return an angle [rad] as a yaw in (MOST_YAW - 2 pi, MOST_YAW]."""
     return MOST_YAW - (MOST_YAW - angle) % (2.0 * np.pi)
+
+
+def least_turn(angle: float) -> float:
+    """Return the yaw [rad] below LEAST_TURN that differs from an angle by half turns."""
+    return LEAST_TURN - (LEAST_TURN - angle) % np.pi
 
 
 def yaw_of(here: Equilibrium) -> float:
@@ -365,30 +372,43 @@ def yaw_gradient(pose: Array) -> Array:
     return (cosine * d_sine - sine * d_cosine) / (cosine**2 + sine**2)
 
 
-def helix_temperature(arm: Arm, turn: float) -> float:
-    """Return the temperature [degC] of the helical TCA at which the straight hanging arm has turned by about `turn` [rad]."""
-    here, temperatures, turns = None, np.linspace(AMBIENT, SOFT_LIMIT, 12), []
+def helix_temperature(robot: Robot, turn: float) -> float:
+    """Return the temperature [degC] of the helical TCAs at which the straight arm has turned by about `turn` [rad]."""
+    arm, limits, twists = robot.built(), robot.limits, helical(robot.arm)
+    here, temperatures, turns = None, np.linspace(limits.ambient, limits.soft, 12), []
     for temperature in temperatures:
-        here = arm.equilibrium([AMBIENT, AMBIENT, AMBIENT, temperature], start=here)
+        here = arm.equilibrium(np.where(twists, temperature, limits.ambient), start=here)
         turns.append(yaw_of(here))
-    return float(np.interp(-turn, -np.array(turns), temperatures))
+    sense = float(np.sign(turns[-1] - turns[0]))  # np.interp asks for rising yaws
+    return float(np.interp(sense * turn, sense * np.array(turns), temperatures))
 
 
-def twisted(arm: Arm, turn: float | None) -> Array:
-    """Return where plans of the whole arm begin (s, 4) [degC]: `BENDING_STARTS`, the helix cold or turned by `turn` [rad]."""
-    helix = AMBIENT if turn is None else helix_temperature(arm, turn)
-    return np.column_stack([BENDING_STARTS, np.full(len(BENDING_STARTS), helix)])
+def starts(robot: Robot, turn: float | None = None) -> Array:
+    """Return initial temperatures of plans (s, n) [degC].
+
+    All bending TCAs are lukewarm, then each one is hot, then each one is cooler than the others. The helical ones are cold or
+    turn the arm by `turn` [rad].
+    """
+    twists, limits = helical(robot.arm), robot.limits
+    each = np.eye(int((~twists).sum()))
+    result = np.full((1 + 2 * len(each), twists.size), limits.ambient)
+    result[:, ~twists] = np.vstack(
+        [np.full(len(each), LUKEWARM), LUKEWARM + (HOT - LUKEWARM) * each, HOT - (HOT - LUKEWARM) * each]
+    )
+    if turn is not None:
+        result[:, twists] = helix_temperature(robot, turn)
+    return result
 
 
-def plan(arm: Arm, aim: Aim, starts: Array) -> Array:
+def plan(robot: Robot, aim: Aim, starts: Array) -> Array:
     """Return temperatures (n,) [degC] between ambient and the soft limit whose steady state misses `aim` least.
 
-    Gauss-Newton from each of `starts` (s, n) until one comes close: in a straight arm the Jacobian hides what heating
-    does sideways, and a start near the answer's branch finds that branch.
+    Gauss-Newton runs from each of `starts` (s, n) until one comes close. The Jacobian of a straight arm does not show how
+    heating bends it sideways, and a start near the solution's branch finds that branch.
     """
-    best, best_distance = np.full(len(arm.muscles), AMBIENT), np.inf
+    best, best_distance = np.full(len(robot.arm.muscles), robot.limits.ambient), np.inf
     for start in starts:
-        temperature, distance = _gauss_newton(arm, aim, start)
+        temperature, distance = _gauss_newton(robot, aim, start)
         if distance < best_distance:
             best, best_distance = temperature, distance
         if best_distance < CLOSE_ENOUGH:
@@ -396,24 +416,24 @@ def plan(arm: Arm, aim: Aim, starts: Array) -> Array:
     return best
 
 
-def _gauss_newton(arm: Arm, aim: Aim, start: Array) -> tuple[Array, float]:
-    """Return the best temperatures found from `start` and by how much they miss the aim [m]."""
-    temperature, damping = start, 1e-3
-    here = steady(arm, temperature)
+def _gauss_newton(robot: Robot, aim: Aim, start: Array) -> tuple[Array, float]:
+    """Return the best temperatures found from `start` and their error [m]."""
+    arm, limits, temperature, damping = robot.built(), robot.limits, start, 1e-3
+    here = steady(robot, temperature)
     error, jacobian = aim(here)
     for _ in range(30):
         if np.linalg.norm(error) < 0.1 * CLOSE_ENOUGH:
             break
         normal = jacobian.T @ jacobian
-        # TCAs at a limit that the step would push beyond it take no part in it.
+        # TCAs that the step would push beyond a limit take no part in it.
         gradient = jacobian.T @ error
-        free = ~(((temperature <= AMBIENT) & (gradient < 0.0)) | ((temperature >= SOFT_LIMIT) & (gradient > 0.0)))
+        free = ~(((temperature <= limits.ambient) & (gradient < 0.0)) | ((temperature >= limits.soft) & (gradient > 0.0)))
         if not free.any():
             break
         step = np.zeros_like(temperature)
         scaled = normal[np.ix_(free, free)] + damping * np.trace(normal) / len(normal) * np.eye(int(free.sum()))
         step[free] = np.clip(np.linalg.solve(scaled, gradient[free]), -40.0, 40.0)
-        trial = np.clip(temperature + step, AMBIENT, SOFT_LIMIT)
+        trial = np.clip(temperature + step, limits.ambient, limits.soft)
         there = arm.equilibrium(trial, start=here)
         new_error, new_jacobian = aim(there)
         if there.converged and np.linalg.norm(new_error) < np.linalg.norm(error):
@@ -422,20 +442,21 @@ def _gauss_newton(arm: Arm, aim: Aim, start: Array) -> tuple[Array, float]:
             break
         else:
             damping *= 5.0
-    # Newton's way may have led to an equilibrium that heating does not lead to.
-    return temperature, float(np.linalg.norm(aim(steady(arm, temperature))[0]))
+    # Newton's iterations may have led to an equilibrium that heating does not reach.
+    return temperature, float(np.linalg.norm(aim(steady(robot, temperature))[0]))
 
 
-def steady(arm: Arm, temperature: Array) -> Equilibrium:
-    """Return the equilibrium that slow heating from ambient to `temperature` reaches."""
-    here = arm.equilibrium(np.full(len(temperature), AMBIENT))
+def steady(robot: Robot, temperature: Array) -> Equilibrium:
+    """Return the equilibrium that slow heating from ambient to `temperature` (n,) [degC] reaches."""
+    arm, ambient = robot.built(), robot.limits.ambient
+    here = arm.equilibrium(np.full(len(temperature), ambient))
     for part in np.linspace(0.1, 1.0, 10):
-        here = arm.equilibrium(AMBIENT + part * (temperature - AMBIENT), start=here)
+        here = arm.equilibrium(ambient + part * (temperature - ambient), start=here)
     return here
 
 
 class RandomPolicy:
-    """Actions drawn uniformly: the floor that every policy is compared with.
+    """A policy with uniformly random actions, the lower bound of comparisons.
 
     Parameters
     ----------
@@ -457,9 +478,7 @@ class RandomPolicy:
         return self.rng.uniform(-1.0, 1.0, (*batch, self.size)).astype(np.float32), None
 
 
-CONTROLLERS: dict[str, Callable[[], SteadyController | PickAndPlaceController]] = {
-    "reach": ReachController,
-    "twist-align": TwistAlignController,
-    "pick-and-place": PickAndPlaceController,
-}
-"""Scripted controller of each task."""
+def controller_of(task: str) -> Any:
+    """Return a controller of a task, as its entry in `tca_envs.registry` names it; None if it names none."""
+    make = registry.load(registry.entry(task).controller)
+    return None if make is None else make()

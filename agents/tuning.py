@@ -1,7 +1,7 @@
 """Search for better settings of a learner with Optuna: `python train.py --tune N`."""
 
-import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,57 +10,58 @@ import optuna
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 
-import train
+from agents import training
 from agents.evaluate import evaluate
+from agents.training import Job
+from tca_envs import registry
 
 SHARE = 0.25
-"""Of a whole training that a trial takes, unless told otherwise."""
+"""Default length of a trial, as a share of a whole training."""
 POINTS = 4
-"""A trial is evaluated so often; from the second point on it is given up if it is worse than the median of those before."""
+"""Evaluations of a trial; from the second on it is stopped if it is worse than the median of earlier trials."""
 EPISODES = 50
-"""Of each point, on goals of the training split."""
+"""Of each evaluation, on goals of the training split."""
 
 
-def tune(task: str, algorithm: str, settings: dict[str, Any], trials: int, options: argparse.Namespace, folder: Path) -> None:
-    """Try settings, print the best ones and leave them in `folder`; what is in there already is gone on with.
+def tune(job: Job, trials: int, steps: int | None, folder: Path) -> None:
+    """Try settings, print the best ones and write them to `folder`; a search that is there is continued.
 
-    The settings with the largest mean return after a part of the training are the best: returns fall with the distance from
-    the goal at every step, so they count the way there, too.
+    The best settings have the largest mean return after a part of the training. Returns fall with the distance from the goal
+    at every step, so they measure how fast it is reached, too.
 
     Parameters
     ----------
-    task, algorithm : str
-        What is trained.
-    settings : dict
-        `agents.hyperparameters.HYPERPARAMETERS` of them: what is not searched stays so.
+    job : Job
+        What is trained: settings that are not searched stay as they are. With the engine ray trials run side by side.
     trials : int
         How many more.
-    options : argparse.Namespace
-        Of `train.py`: seed, device, and steps of a trial; with the engine ray trials run side by side.
+    steps : int, optional
+        Environment steps of a trial; SHARE of a whole training by default.
     folder : pathlib.Path
         Gets the study as `study.db`, for Optuna's own tools, and the best settings as `best.yml`, as in
         `agents/hyperparameters`.
     """
+    training.set_threads(job.threads)
     folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    steps = options.steps or int(SHARE * settings["n_timesteps"])
+    steps_of_trial = steps or int(SHARE * job.settings["n_timesteps"])
 
     def open_study(seed: int) -> optuna.Study:
         return optuna.create_study(
             storage=f"sqlite:///{folder / 'study.db'}",
-            study_name=f"{task}-{algorithm}",
+            study_name=f"{registry.entry(job.task).name}-{job.algorithm}",
             load_if_exists=True,
             direction="maximize",
-            sampler=optuna.samplers.TPESampler(seed=seed, constant_liar=options.engine == "ray"),
+            sampler=optuna.samplers.TPESampler(seed=seed, constant_liar=job.engine == "ray"),
             pruner=optuna.pruners.MedianPruner(n_startup_trials=3, n_warmup_steps=1),
         )
 
     def worth(trial: optuna.Trial) -> float:
-        chosen = {**settings, **SPACES[algorithm](trial, settings)}
+        chosen = {**job.settings, **SPACES[job.algorithm](trial, job.settings)}
         trial.set_user_attr("settings", chosen)
-        model = train.build(algorithm, chosen, options)
-        judge = Judge(trial, gymnasium.make_vec(settings["env"], EPISODES), steps)
-        model.learn(steps, callback=judge)
+        model = training.build(replace(job, settings=chosen))
+        judge = Judge(trial, gymnasium.make_vec(job.settings["env"], EPISODES), steps_of_trial)
+        model.learn(steps_of_trial, callback=judge)
         return judge.worth
 
     def say(_: optuna.Study, trial: optuna.trial.FrozenTrial) -> None:
@@ -68,17 +69,17 @@ def tune(task: str, algorithm: str, settings: dict[str, Any], trials: int, optio
         tried = ", ".join(f"{name} {short(given)}" for name, given in trial.params.items())
         print(f"trial {trial.number}: {value}, {tried}")
 
-    study = open_study(options.seed)
-    if options.engine == "ray":
+    study = open_study(job.seed)
+    if job.engine == "ray":
         from agents.ray_engine import run_trials
 
         def one(number: int) -> dict[str, Any]:
-            """Run a trial in a process of its own; they meet in the file of the study."""
-            open_study(options.seed + number).optimize(worth, n_trials=1)
+            """Run a trial in a process of its own; they share the file of the study."""
+            open_study(job.seed + number).optimize(worth, n_trials=1)
             return {}
 
         begun = len(study.trials)
-        run_trials(one, range(begun, begun + trials), options.workers)
+        run_trials(one, range(begun, begun + trials), job.workers)
         for trial in study.trials[begun:]:
             say(study, trial)
     else:
@@ -97,7 +98,7 @@ def short(value: Any) -> str:
 
 
 class Judge(BaseCallback):
-    """Evaluates a trial on its way, tells Optuna, and gives it up if that asks for it."""
+    """Evaluate a trial during training, report to Optuna, and stop the trial if Optuna asks for it."""
 
     def __init__(self, trial: optuna.Trial, env: Any, steps: int) -> None:
         super().__init__()
@@ -117,13 +118,13 @@ class Judge(BaseCallback):
 
     def add_point(self) -> None:
         """Evaluate."""
-        self.worth = evaluate(self.model, self.env, EPISODES, train.CURVE_SEED).episode_return
+        self.worth = evaluate(self.model, self.env, EPISODES, training.CURVE_SEED).episode_return
         self.trial.report(self.worth, self.points)
         self.points += 1
 
 
 def _any(trial: optuna.Trial) -> dict[str, Any]:
-    """Return what is searched for every learner."""
+    """Return the settings to try of every learner."""
     rate = trial.suggest_float("learning_rate", 1e-4, 5e-3, log=True)
     return {"learning_rate": f"lin_{rate:.2g}"}
 
@@ -176,4 +177,4 @@ SPACES: dict[str, Callable[[optuna.Trial, dict[str, Any]], dict[str, Any]]] = {
     "her": sac,
     "dagger": dagger,
 }
-"""What is searched for each algorithm."""
+"""Search space of each algorithm."""

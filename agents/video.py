@@ -1,4 +1,4 @@
-"""Videos of policies at work: MP4 by MoviePy, animated WebP and GIF by Pillow."""
+"""Videos of policies: MP4 by MoviePy, animated WebP and GIF by Pillow."""
 
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,13 @@ from agents.evaluate import Policy
 Frames = list[NDArray[np.uint8]]
 
 HELD_STEPS = 15
-"""An episode is shown until its goal is held for so many steps."""
+"""An episode is shown until its goal has been held for this number of steps."""
 SUFFIXES = (".mp4", ".webp", ".gif")
 WEBP_QUALITY = 70
 
 
 def frames(policy: Policy, env: gymnasium.Env[Any, Any], episodes: int = 1, seed: int = 0) -> Frames:
-    """Return pictures of episodes, one a step.
+    """Return the pictures of episodes, one per step.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def frames(policy: Policy, env: gymnasium.Env[Any, Any], episodes: int = 1, seed
     env : gymnasium.Env
         With render mode "rgb_array" and a time limit.
     episodes : int
-        How many; each ends where the goal was held for HELD_STEPS.
+        How many; each ends when the goal has been held for HELD_STEPS.
     seed : int
         Episode i is seeded with `seed` + i.
 
@@ -65,7 +65,7 @@ def save(shown: Frames, path: Path, fps: int) -> None:
     Raises
     ------
     ValueError
-        For another suffix than SUFFIXES, or without pictures.
+        If the suffix is not in SUFFIXES or there are no pictures.
     ModuleNotFoundError
         If MoviePy is missing and the suffix needs it.
     """

@@ -1,4 +1,4 @@
-"""Pages that MkDocs makes while it builds the site: overview, environments, equations. Named as a hook in mkdocs.yml."""
+"""A hook of MkDocs, named in mkdocs.yml: makes the overview and the environments' pages, and converts equations."""
 
 import inspect
 import re
@@ -12,30 +12,29 @@ from gymnasium import spaces
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 
-import tca_envs  # noqa: F401
-from tca_envs.tasks import TASKS
+import tca_envs  # noqa: F401  (registers the environments)
+from tca_envs import registry
 
 ROOT = Path(__file__).parents[1]
-OVERVIEW = ("Start", "Use", "Environments", "Cite")
-"""Sections of the README that the overview shows after its opening."""
 FONT = Path(str(distribution("ziamath").locate_file("ziamath/fonts/STIXTwoMath-Regular.ttf")))
-"""Browsers place scripts and brackets well only with a font that is made for mathematics; site.css names it."""
+"""Browsers place indices and brackets well only with a font for mathematics; site.css names it."""
 PICTURES = (".webp", ".gif", ".png")
-"""A task's picture in docs/ has its name and one of these, the first that is there."""
+"""A picture of a task in docs/ has the task's name and the first of these endings that exists."""
 
 
 def on_files(files: Any, config: Any) -> Any:
     """Add the overview, a page for each task and the font of the equations."""
     files.append(File.generated(config, "index.md", content=overview((ROOT / "README.md").read_text(encoding="utf-8"))))
-    for name in TASKS:
-        picture = next((name + end for end in PICTURES if files.get_file_from_path(name + end)), None)
-        files.append(File.generated(config, f"environments/{name}.md", content=environment(name, picture)))
+    for entry in registry.entries():
+        if entry.page is not None:
+            picture = next((entry.name + end for end in PICTURES if files.get_file_from_path(entry.name + end)), None)
+            files.append(File.generated(config, entry.page, content=environment(entry, picture)))
     files.append(File.generated(config, FONT.name, abs_src_path=str(FONT)))
     return files
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Turn what `pymdownx.arithmatex` marks as LaTeX into MathML, which needs no script; keep short cells in one line."""
+    """Turn LaTeX that `pymdownx.arithmatex` marked into MathML, which needs no script; keep short cells on one line."""
     html = re.sub(r'<span class="arithmatex">\\\((.*?)\\\)</span>', lambda m: convert(unescape(m[1])), html, flags=re.S)
     html = re.sub(
         r'<div class="arithmatex">\\\[(.*?)\\\]</div>',
@@ -47,18 +46,15 @@ def on_page_content(html: str, **_: Any) -> str:
 
 
 def overview(readme: str) -> str:
-    """Return the README's opening and some of its sections; its links start in docs/."""
-    opening, *sections = re.split(r"^(?=## )", readme, flags=re.M)
-    by_title = {section.splitlines()[0].removeprefix("## "): section for section in sections}
-    text = "".join([opening, *(by_title[title] for title in OVERVIEW)])
+    """Return the README without its license; links start in docs/ instead of the repository's root."""
+    text, _, _ = readme.partition("\n## License\n")
     return re.sub(r'(\]\(|src=")docs/', r"\1", text)
 
 
-def environment(name: str, picture: str | None) -> str:
-    """Return a task's page: its ids and spaces as Gymnasium sees them, and the docstring of its class."""
-    task = TASKS[name]
-    assert isinstance(task, type)
-    specs = [spec for spec in gymnasium.registry.values() if spec.kwargs.get("task") == name]
+def environment(entry: registry.Entry, picture: str | None) -> str:
+    """Return the page of a task: ids and spaces as Gymnasium sees them, and the docstring of its class."""
+    task = registry.load(entry.task)
+    specs = [gymnasium.spec(name) for name in entry.ids.values()]
     env = gymnasium.make(specs[0].id)
     boxes = env.observation_space
     assert isinstance(boxes, spaces.Dict)

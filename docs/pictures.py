@@ -1,35 +1,31 @@
-"""Draw the animated pictures of the tasks: python docs/pictures.py writes docs/reach.webp and so on (needs the extra `render`).
+"""Draw the tasks' animated pictures, docs/reach.webp and so on: python docs/pictures.py (needs the extra `render`).
 
-They show episodes that the scripted controllers solve.
+They show episodes under the scripted controllers.
 """
 
 from pathlib import Path
 
 import gymnasium
 
-import tca_envs  # noqa: F401  (registers the environments)
-from agents.scripted import CONTROLLERS
 from agents.video import frames, save
-from tca_envs.render import FPS
+from tca_envs import registry
 
 SIZE = 400
 """[pixel]"""
-EPISODES = {
-    "reach": ("TCAReach-v0", (1, 7, 0)),
-    "twist-align": ("TCATwistAlign-v0", (9, 8, 14)),
-    "pick-and-place": ("TCAPickAndPlace-v0", (8,)),
-}
-"""Environment and seeds of each task's episodes: those with much to see."""
+EPISODES = {"reach": (1, 7, 0), "twist-align": (9, 8, 14), "pick-and-place": (8,)}
+"""Seeds of the episodes of each task, chosen for much motion."""
 
 
 def main() -> None:
-    """Write them."""
-    for task, (name, seeds) in EPISODES.items():
-        env = gymnasium.make(name, render_mode="rgb_array", width=SIZE, height=SIZE)
-        shown = [picture for seed in seeds for picture in frames(CONTROLLERS[task](), env, seed=seed)]
-        env.close()
+    """Write a picture for each task."""
+    for task, seeds in EPISODES.items():
+        entry = registry.entry(task)
+        controller = registry.load(entry.controller)
+        env = gymnasium.make(entry.ids["sparse"], render_mode="rgb_array", width=SIZE, height=SIZE)
+        shown = [picture for seed in seeds for picture in frames(controller(), env, seed=seed)]
         path = Path(__file__).with_name(f"{task}.webp")
-        save(shown, path, FPS)
+        save(shown, path, env.metadata["render_fps"])
+        env.close()
         print(f"wrote {path.name}: {len(shown)} pictures, {path.stat().st_size / 1e6:.2f} MB")
 
 

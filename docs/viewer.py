@@ -1,4 +1,4 @@
-"""Take a still of the viewer: python docs/viewer.py writes docs/viewer.png (needs the extras `viewer` and `test`, Chromium)."""
+"""Take a picture of the viewer: python docs/viewer.py (needs Chromium and the extras `viewer` and `test`)."""
 
 import shutil
 from pathlib import Path
@@ -8,7 +8,7 @@ from playwright.sync_api import sync_playwright
 from tca_envs.viewer.server import Viewer
 
 SEED, STEPS = 35, 57
-"""The episode, and so many steps of it: the arm, bent and hot, carries the object to its goal."""
+"""Seed of the episode and number of steps, after which the arm, bent and hot, carries the object to its goal."""
 WITHOUT_A_GRAPHICS_CARD = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 

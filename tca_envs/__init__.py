@@ -1,17 +1,50 @@
 """Gymnasium environments for a soft arm driven by heated twisted-and-coiled actuators. Importing registers their ids."""
 
-import gymnasium
+from tca_envs.registry import Entry, register
 
-for _name, _task, _steps in (
-    ("TCAReach", "reach", 100),
-    ("TCATwistAlign", "twist-align", 100),
-    ("TCAPickAndPlace", "pick-and-place", 300),
-):
-    for _suffix, _reward in (("", "sparse"), ("Dense", "dense")):
-        gymnasium.register(
-            id=f"{_name}{_suffix}-v0",
-            entry_point="tca_envs.env:ArmEnv",
-            vector_entry_point="tca_envs.vector:ArmVectorEnv",
-            max_episode_steps=_steps,
-            kwargs={"task": _task, "reward": _reward},
-        )
+register(
+    Entry(
+        name="reach",
+        id="TCAReach",
+        task="tca_envs.tasks.reach:Reach",
+        robot="tca_envs.robots.paper:BENDING",
+        controller="agents.scripted:ReachController",
+        fastest="agents.fastest:reach_time",
+        features="agents.features:reach",
+        settings="agents.hyperparameters:of",
+        algorithm="ppo",
+        scene="study.scenes:reach",
+        page="environments/reach.md",
+    )
+)
+register(
+    Entry(
+        name="twist-align",
+        id="TCATwistAlign",
+        task="tca_envs.tasks.twist_align:TwistAlign",
+        robot="tca_envs.robots.paper:WHOLE",
+        controller="agents.scripted:TwistAlignController",
+        fastest="agents.fastest:twist_align_time",
+        features="agents.features:twist_align",
+        settings="agents.hyperparameters:of",
+        algorithm="ppo",
+        scene="study.scenes:twist_align",
+        page="environments/twist-align.md",
+    )
+)
+register(
+    Entry(
+        name="pick-and-place",
+        id="TCAPickAndPlace",
+        task="tca_envs.tasks.pick_and_place:PickAndPlace",
+        robot="tca_envs.robots.paper:GRIPPING",
+        steps=300,
+        controller="agents.scripted:PickAndPlaceController",
+        fastest="agents.fastest:pick_and_place_time",
+        features="agents.features:pick_and_place",
+        settings="agents.hyperparameters:of",
+        algorithm="dagger",
+        scene="study.scenes:pick_and_place",
+        page="environments/pick-and-place.md",
+    )
+)

@@ -3,17 +3,16 @@
 import math
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from tca_envs.mechanics.kernels import FAILED
-from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT
-from tca_envs.tasks import TASKS
-from tca_envs.tasks.core import Core, Record
+from tca_envs import registry
+from tca_envs.mechanics import compiled
+from tca_envs.tasks.core import Core, Record, Solve, solved
 from tca_envs.tasks.task import Array, Outcome, Task
 
 Observation = dict[str, NDArray[Any]]
@@ -21,13 +20,27 @@ Observation = dict[str, NDArray[Any]]
 REWARDS = ("sparse", "dense")
 
 
-def new_task(task: str, reward: str, split: str, tolerance: float) -> Task:
+SOLVERS = {"collocation": "tca_envs.mechanics.continuation:solve", "shooting": "study.shooting:solve"}
+"""What can bring arms to equilibrium, by name: references to functions, see `tasks.core.Core`."""
+
+
+def new_task(task: str, reward: str, arguments: Mapping[str, Any]) -> Task:
     """Return the task that the arguments of an environment ask for; ValueError if there is none."""
-    if not isinstance(task, str) or task not in TASKS:
-        raise ValueError(f"task = {task!r}: expected one of {', '.join(map(repr, TASKS))}")
+    found = registry.entry(task)
     if not isinstance(reward, str) or reward not in REWARDS:
         raise ValueError(f"reward = {reward!r}: expected one of {', '.join(map(repr, REWARDS))}")
-    return TASKS[task](split, tolerance)
+    made: Task = found.new(**arguments)
+    return made
+
+
+def new_solver(solver: Any) -> Solve:
+    """Return the function that a name in SOLVERS stands for, or a function as it is; ValueError for anything else."""
+    if isinstance(solver, str) and solver in SOLVERS:
+        solver = registry.load(SOLVERS[solver])
+    if not callable(solver):
+        raise ValueError(f"solver = {solver!r}: expected one of {', '.join(map(repr, SOLVERS))}, or a function")
+    found: Solve = solver
+    return found
 
 
 def action_space(task: Task) -> spaces.Box:
@@ -54,16 +67,18 @@ def checked_actions(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     return actions
 
 
-@njit(cache=True, error_model="numpy", nogil=True)  # without fast mathematics, so that N changes no number
-def _look(temperature, power, full_power, achieved, goal, report, seen, reached, desired, numbers, counts, flags):
+@partial(compiled, fastmath=False)  # so that N changes no number
+def _look(record, heat, achieved, seen, reached, desired, numbers):
     """Write what all tasks observe and tell alike; as array operations it takes as long as a solve."""
+    temperature, power, goal = record
+    full_power, ambient, soft = heat
     for i in range(len(temperature)):
         muscles = temperature.shape[1]
         cost = 0.0
         for j in range(muscles):
-            seen[i, j] = (temperature[i, j] - AMBIENT) / (SOFT_LIMIT - AMBIENT)
+            seen[i, j] = (temperature[i, j] - ambient) / (soft - ambient)
             seen[i, muscles + j] = power[i, j] / full_power[j]
-            cost += max(temperature[i, j] - SOFT_LIMIT, 0.0)
+            cost += max(temperature[i, j] - soft, 0.0)
         square = 0.0
         for j in range(goal.shape[1]):
             reached[i, j], desired[i, j] = achieved[i, j], goal[i, j]
@@ -71,17 +86,13 @@ def _look(temperature, power, full_power, achieved, goal, report, seen, reached,
                 away = np.float64(reached[i, j]) - np.float64(desired[i, j])
                 square += away * away
         numbers[AWAY, i], numbers[COST, i] = math.sqrt(square), cost
-        counts[RUNG, i], counts[ITERATIONS, i] = int(report[i, 0]), int(report[i, 2])
-        flags[CONVERGED, i], flags[JUMPED, i] = report[i, 0] != FAILED, report[i, 3] != 0.0
 
 
 AWAY, COST = 0, 1
-RUNG, ITERATIONS = 0, 1
-CONVERGED, JUMPED = 0, 1
 """Rows of what `_look` writes."""
 
 
-def look(task: Task, core: Core, report: Array) -> tuple[Observation, Outcome, dict[str, Any]]:
+def look(task: Task, core: Core, report: Any) -> tuple[Observation, Outcome, dict[str, Any]]:
     """Return what is to be seen of all lanes after a step or a reset.
 
     Parameters
@@ -90,24 +101,22 @@ def look(task: Task, core: Core, report: Array) -> tuple[Observation, Outcome, d
         Of the lanes.
     core : Core
         N lanes.
-    report : (N, REPORT) array
-        Of the solver.
+    report : (N,) structured array
+        Of the solver, see `continuation.solve`.
 
     Returns
     -------
     tuple
-        Observations, arrays of their own; what is to be said of their goals; and infos, arrays (N,) that may be views.
+        Observations, arrays of their own; the outcome of their goals; and infos, arrays (N,) that may be views.
     """
-    record = core.record
+    record, limits = core.record, task.robot.limits
     lanes, goals = record.goal.shape
     seen = np.empty((lanes, *task.observation_space.shape), dtype=np.float32)
     reached, desired = np.empty((lanes, goals), dtype=np.float32), np.empty((lanes, goals), dtype=np.float32)
-    numbers, counts, flags = np.empty((2, lanes)), np.empty((2, lanes), dtype=np.int64), np.empty((2, lanes), dtype=np.bool_)
-    _look(
-        record.temperature, record.power, core.heating.max_power, task.achieved(record), record.goal, report, seen, reached,
-        desired, numbers, counts, flags,
-    )  # fmt: skip
-    task.observe(core, reached, seen)
+    numbers = np.empty((2, lanes))
+    heat = (core.heating.max_power, limits.ambient, limits.soft)
+    _look((record.temperature, record.power, record.goal), heat, task.achieved(record), seen, reached, desired, numbers)
+    task.observe(core, reached, seen[:, 2 * record.power.shape[1] :])
     outcome = task.judge(reached, desired, numbers[AWAY])
     info = {
         "is_success": outcome.success,
@@ -115,22 +124,14 @@ def look(task: Task, core: Core, report: Array) -> tuple[Observation, Outcome, d
         "energy_J": record.energy,
         "cost": numbers[COST],
         "solver": {
-            "converged": flags[CONVERGED],
-            "residual": report[:, 1],
-            "iterations": counts[ITERATIONS],
-            "rung": counts[RUNG],
-            "jumped": flags[JUMPED],
+            "converged": solved(report),
+            "residual": report["residual"],
+            "iterations": report["iterations"],
+            "rung": report["rung"],
+            "jumped": report["jumped"],
         },
     }
     return {"observation": seen, "achieved_goal": reached, "desired_goal": desired}, outcome, info
-
-
-def outcome(task: Task, achieved: ArrayLike, desired: ArrayLike) -> Outcome:
-    """Return what is to be said of goals (..., k)."""
-    reached, asked = np.asarray(achieved), np.asarray(desired)
-    apart = reached[..., :3].astype(np.float64) - asked[..., :3]
-    x, y, z = apart[..., 0], apart[..., 1], apart[..., 2]
-    return task.judge(reached, asked, np.sqrt(x * x + y * y + z * z))
 
 
 def rewards(reward: str, outcome: Outcome) -> Array:
@@ -140,7 +141,7 @@ def rewards(reward: str, outcome: Outcome) -> Array:
 
 def compute_reward(task: Task, reward: str, achieved: ArrayLike, desired: ArrayLike) -> Any:
     """Return the reward of a goal (k,) as a float, or of a batch (..., k) as a float32 array (...,)."""
-    found = rewards(reward, outcome(task, achieved, desired))
+    found = rewards(reward, task.outcome(achieved, desired))
     return float(found) if np.ndim(found) == 0 else found.astype(np.float32)
 
 

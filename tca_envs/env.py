@@ -7,9 +7,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs import batch, presets, render
+from tca_envs import batch, render
 from tca_envs.mechanics import Arm
-from tca_envs.tasks.core import solved
+from tca_envs.tasks.core import STEP_S, solved
 
 
 class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
@@ -18,48 +18,50 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
     Parameters
     ----------
     task : str
-        Name in `tca_envs.tasks.TASKS`.
+        Name of a task in `tca_envs.registry`, or "module:name": then the module is imported first.
     reward : str
         "sparse" or "dense".
-    split : str
-        Where goals come from: "train" or "held-out".
-    tolerance : float
-        Largest error of the arm's tip [m], 1e-9 to 1e-3. The cheapest discretisation that keeps to it over the task's states
-        is chosen; `env.unwrapped.arm.discretisation` prints it.
     render_mode : str, optional
         "rgb_array" or "depth_array": `render` returns pictures; "human": a window shows every step in real time.
     width, height : int
         Of pictures or the window [pixel].
     camera : str or pair of (3,) arrays
         "front", "side", "above" or "gripper", or where it stands and at what it looks [m] in the base frame, z down.
+    solver : str or function
+        What finds equilibria: "collocation"; "shooting", the paper's method, warm-started, slow, and in a checkout of the
+        repository only; or a function with the signature of `tca_envs.mechanics.continuation.solve`.
+    **arguments
+        Of the task: those of `tca_envs.tasks.task.Task`, such as `robot`, `split`, `tolerance` and `step_s`, and its own, such
+        as `success_mm`.
 
     Raises
     ------
     ValueError
-        If an argument is none of these.
+        If an argument has a value that it cannot have.
     gymnasium.error.DependencyNotInstalled
         If a render mode is asked for and PyVista is missing.
     """
 
-    metadata: dict[str, Any] = {"render_modes": list(render.MODES), "render_fps": render.FPS}  # noqa: RUF012  # as Gymnasium
+    # A dictionary of the class, as Gymnasium has it; instances have their own.
+    metadata: dict[str, Any] = {"render_modes": list(render.MODES), "render_fps": render.fps(STEP_S)}  # noqa: RUF012
 
     def __init__(
         self,
         task: str = "reach",
         reward: str = "sparse",
-        split: str = "train",
-        tolerance: float = presets.TOLERANCE,
         render_mode: str | None = None,
         width: int = render.SIZE,
         height: int = render.SIZE,
         camera: render.Camera = "front",
+        solver: Any = "collocation",
+        **arguments: Any,
     ) -> None:
-        self.task = batch.new_task(task, reward, split, tolerance)
+        self.task = batch.new_task(task, reward, arguments)
         self._renderer = render.new_renderer(render_mode, width, height, camera)
         self.render_mode = render_mode
-        self.metadata = deepcopy(self.metadata)
+        self.metadata = deepcopy(self.metadata) | {"render_fps": render.fps(self.task.step_s)}
         self.reward = reward
-        self.core = self.task.core(1)
+        self.core = self.task.core(1, batch.new_solver(solver))
         self.action_space = batch.action_space(self.task)
         self.observation_space = batch.observation_space(self.task)
 
@@ -68,15 +70,15 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
     ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Start an episode from rest with a new goal; see `gymnasium.Env.reset`. No option is known."""
         super().reset(seed=seed)
-        goals, scenes = self.task.draw(self.core, [self.np_random])
+        goals, scenes = self.task.sample(self.core, [self.np_random])
         self.core.reset(np.zeros(1, dtype=np.intp), goals, scenes)
-        observation, _, info = self._told(self.core.rest_report)
+        observation, _, info = self._result(self.core.rest_report)
         if self.render_mode == "human":
             self.render()
         return observation, info
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, NDArray[Any]], float, bool, bool, dict[str, Any]]:
-        """Act for 0.1 s; see `gymnasium.Env.step`.
+        """Act for one step; see `gymnasium.Env.step`.
 
         Raises
         ------
@@ -85,12 +87,12 @@ class ArmEnv(gymnasium.Env[Any, NDArray[Any]]):
         """
         command = batch.checked_actions("action", action, (self.task.actions,))
         report = self.task.step(self.core, command[np.newaxis])
-        observation, reward, info = self._told(report)
+        observation, reward, info = self._result(report)
         if self.render_mode == "human":
             self.render()
         return observation, reward, False, not solved(report[0]), info
 
-    def _told(self, report: NDArray[np.float64]) -> tuple[dict[str, NDArray[Any]], float, dict[str, Any]]:
+    def _result(self, report: NDArray[np.float64]) -> tuple[dict[str, NDArray[Any]], float, dict[str, Any]]:
         """Return observation, reward and info: the only row of a batch of one."""
         observation, outcome, info = batch.look(self.task, self.core, report)
         reward = batch.rewards(self.reward, outcome)

@@ -1,24 +1,22 @@
-"""What there is to see of a lane: surfaces of arm, coils, gripper, object, goal and stage, from the solver's own shape.
+"""Surfaces to draw with: those of an arm in equilibrium, and boxes, balls, discs, coils and rings.
 
-Plain arrays [m] in the base frame with the stage up, z down; `render` and `viewer` draw them. A surface of the same name keeps
-its triangles, so that only vertices move.
+Plain arrays [m] in the base frame with the stage up, z down. A robot and a task say by them what there is to see; `render` and
+`viewer` draw it. A surface of the same name keeps its triangles, so that only vertices move.
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
-from math import cos, hypot, pi, radians
+from math import cos, pi, radians
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs import batch, presets
-from tca_envs.mechanics import Arm, grasp
-from tca_envs.mechanics.ladder import Lane
-from tca_envs.mechanics.muscle import REFERENCE_LENGTH
+from tca_envs.mechanics import TCA, Arm, Gripper
+from tca_envs.mechanics.continuation import Lane
+from tca_envs.mechanics.laws import REFERENCE_LENGTH
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
-from tca_envs.tasks import pick_and_place, reach, twist_align
-from tca_envs.tasks.core import Core, Record
-from tca_envs.tasks.task import Task
 
 Array = NDArray[np.float64]
 Triangles = NDArray[np.int32]
@@ -29,14 +27,12 @@ RINGS = 25
 """Cross sections drawn of a module."""
 TURN, FIBRE = 8, 5
 """Points of a coil's turn, sides of its fibre."""
-PLATE = 5.6e-3
-"""Radius of the plates between which the coils hang [m]: just outside of them."""
+PLATE_EDGE = 1.6e-3
+"""How far the plates between which the coils hang reach beyond the coils' axes [m]: just outside of the coils."""
 PLATE_THICKNESS = 0.8e-3
 """[m]."""
-HALF_OBJECT = (0.5 * presets.OBJECT.width, 0.5 * presets.OBJECT.length, 0.5 * presets.OBJECT.height)
-"""Half edges of the object [m]."""
-TABLE_HALF = 60e-3
-"""Half an edge of the table [m]."""
+TABLE_HALF = 60.0 / 86.8
+"""Half an edge of the table as a share of its depth under the base."""
 BODY, RING, OBJECT = "#efe9dc", "#a9cbdc", "#2f7d55"
 """Colours of soft body, gripper and object ..."""
 GOAL, DONE = "#2a9df4", "#43c97a"
@@ -67,43 +63,71 @@ class Part(NamedTuple):
     """(k, 3) the line along which a body, coil or ring is swept [m]."""
 
 
-def parts(task: Task, core: Core, lane: int = 0) -> dict[str, Part]:
-    """Return all that is to be seen of a lane, by name.
+Parts = Mapping[str, Part]
+"""What there is to see, by name."""
+
+
+@dataclass(frozen=True)
+class Coil:
+    """How a TCA's fibre is wound; by default that of the measured ones, whose values are those of `TCA.untwist_gain`.
 
     Parameters
     ----------
-    task : Task
-        Of the lane.
-    core : Core
-        Holds it.
-    lane : int
-        Which one.
-
-    Returns
-    -------
-    dict of str to Part
-        "module K" and "plate K" base to tip, "coil K" for every TCA of the arm, gripper's parts ("ring 0", "ring 1", and
-        "gripper coil" where it is heated), "object", "goal" and what else marks it, "stage", "column" and "table".
+    fibre_length : float
+        Of the fibre in a 45 mm TCA [m].
+    radius : float
+        Of the fibre's centerline around the coil's axis [m].
+    pitch_deg : float
+        Angle of the fibre against the coil's cross section.
     """
-    record = core.record.rows(np.array([lane]))
-    down = np.array([0.0, 0.0, record.scene[0, grasp.STAGE] if record.scene.size else 0.0])
-    result = arm_parts(core.arm, Lane(record.strain[0], record.tension[0], record.drive[0], record.load[0]))
-    result |= _below(task, record)
-    result = {name: moved(part, down) for name, part in result.items()}
-    result |= _goal(task, record) | site_parts(float(down[2]))
-    if isinstance(task, pick_and_place.PickAndPlace):
-        result["object"] = box(
-            record.scene[0, grasp.X : grasp.Z + 1], HALF_OBJECT, OBJECT, turn=float(record.scene[0, grasp.YAW])
-        )
-    return result
+
+    fibre_length: float = 144.5e-3
+    radius: float = 0.3725e-3
+    pitch_deg: float = 18.14
+
+    @property
+    def fibre_diameter(self) -> float:
+        """[m]: C = l r^2 cos^2(alpha)/J with J = pi d^4/32, of which `TCA.compliance_gain` was measured (paper, eq. (23))."""
+        lever = self.radius * cos(radians(self.pitch_deg))
+        return float((32.0 / pi * self.fibre_length * lever**2 / TCA.compliance_gain) ** 0.25)
+
+    def turns(self, rest_length: float) -> float:
+        """Return how often a TCA of that rest length [m] winds around its axis."""
+        return rest_length / REFERENCE_LENGTH * self.fibre_length * cos(radians(self.pitch_deg)) / (2.0 * pi * self.radius)
+
+    def part(self, axis: Array, out: Array, turns: float, temperature: float) -> Part:
+        """Return the fibre wound around a line.
+
+        Parameters
+        ----------
+        axis : (k, 3) array
+            The coil's axis, evenly in its turns [m].
+        out : (k, 3) array
+            Directions that are not along the axis, of any length.
+        turns : float
+            How often it winds.
+        temperature : float
+            [degC].
+        """
+        first, second = _around(axis, out)
+        angle = 2.0 * pi * turns * np.linspace(0.0, 1.0, len(axis))[:, np.newaxis]
+        radial = np.cos(angle) * first + np.sin(angle) * second
+        fibre = axis + self.radius * radial
+        outline = circle(0.5 * self.fibre_diameter, FIBRE)
+        return sweep(fibre, *_around(fibre, radial), *outline, BODY)._replace(temperature=temperature, axis=axis)
 
 
-def arm_parts(arm: Arm, lane: Lane) -> dict[str, Part]:
+MEASURED_COIL = Coil()
+
+
+def arm_parts(arm: Arm, lane: Lane, winding: Coil = MEASURED_COIL) -> dict[str, Part]:
     """Return modules, plates at their ends and coils of an arm in equilibrium; drives are the coils' temperatures.
 
-    A module is drawn with the round section that has its stiffness, EI/EA = radius^2/4.
+    They are "module K", "plate K top" and "plate K bottom", base to tip, and "coil K" for every TCA. A module is drawn with the
+    round section that has its stiffness, EI/EA = radius^2/4.
     """
-    turns = [coil_turns(module.rest_length(m)) for module in arm.modules for m in module.muscles]
+    turns = [winding.turns(module.rest_length(m)) for module in arm.modules for m in module.muscles]
+    plate = plate_radius(arm)
     places, base, number = [], 0.0, 0
     for module in arm.modules:
         counts = [RINGS, *(round(TURN * turns[number + i]) + 1 for i in range(len(module.muscles)))]
@@ -117,91 +141,70 @@ def arm_parts(arm: Arm, lane: Lane) -> dict[str, Part]:
         radius = 2.0 * float(np.sqrt(module.stiffness[0] / module.stiffness[5]))
         result[f"module {k}"] = sweep(body[:, :3, 3], body[:, :3, 0], body[:, :3, 1], *circle(radius, CIRCLE), BODY)
         for end, pose in (("top", body[0]), ("bottom", body[-1])):
-            result[f"plate {k} {end}"] = disc(pose, PLATE, PLATE_THICKNESS, METAL)
+            result[f"plate {k} {end}"] = disc(pose, plate, PLATE_THICKNESS, METAL)
         for muscle in module.muscles:
             frames = next(poses)
-            route = module.route(muscle, np.linspace(0.0, 1.0, len(frames)))[:, :2]
+            route = muscle.route(module.length, np.linspace(0.0, 1.0, len(frames)))[:, :2]
             out = np.einsum("kij,kj->ki", frames[:, :3, :2], route)
-            result[f"coil {number}"] = coil(frames[:, :3, 3] + out, out, turns[number], float(lane.drive[number]))
+            result[f"coil {number}"] = winding.part(frames[:, :3, 3] + out, out, turns[number], float(lane.drive[number]))
             number += 1
     return result
 
 
-def ring_parts(mount: Array, gap: float, temperature: float | None) -> dict[str, Part]:
-    """Return the gripper's two halves, arcs of constant curvature with ends `gap` apart, and its coil if it has a temperature.
+def plate_radius(arm: Arm) -> float:
+    """Return the radius [m] of plates between which all coils of an arm hang."""
+    fractions = np.linspace(0.0, 1.0, RINGS)
+    routes = [muscle.route(module.length, fractions)[:, :2] for module in arm.modules for muscle in module.muscles]
+    return max(float(np.linalg.norm(route, axis=1).max()) for route in routes) + PLATE_EDGE
+
+
+def ring_parts(mount: Array, ring: Gripper, section: tuple[float, float], gap: float = 0.0) -> dict[str, Part]:
+    """Return the two halves of a ring, arcs of constant curvature with ends `gap` apart, as "ring 0" and "ring 1".
 
     Parameters
     ----------
     mount : (4, 4) array
         Pose of the arm's tip: the jaws open along its x axis, its z axis points to them.
+    ring : Gripper
+        Whose length is drawn.
+    section : tuple of float
+        Of the ring, radial and axial [m].
     gap : float
         [m].
-    temperature : float, optional
-        Of the gripper's TCA [degC].
     """
-    half = 0.5 * presets.GRIPPER_LENGTH
-    bend = _bend(gap / (2.0 * half))
+    half, bend = 0.5 * ring.length, _bend(gap / ring.length)
     arc = np.linspace(0.0, half, RINGS)
-    outline = rectangle(0.5 * presets.GRIPPER_THICKNESS, 0.5 * presets.GRIPPER_WIDTH)
+    outline = rectangle(0.5 * section[0], 0.5 * section[1])
     result: dict[str, Part] = {}
-    paths: list[tuple[Array, Array]] = []
     for number, side in enumerate((-1.0, 1.0)):
         line, out = (_in(mount, part) for part in _arc(arc, bend / half, side))
-        outwards = out - mount[:3, 3]
         across = np.broadcast_to(side * mount[:3, 1], line.shape)
-        result[f"ring {number}"] = sweep(line, outwards, across, *outline, RING)
-        paths.append((line, outwards))
-    if temperature is not None:
-        rest = presets.gripper().rest_length
-        count = round(TURN * coil_turns(rest) / 2.0)
-        fine = np.linspace(0.0, half, count + 1)
-        lines, outs = zip(*(_arc(fine, bend / half, side) for side in (-1.0, 1.0)), strict=True)
-        line = _in(mount, np.concatenate([lines[0][:0:-1], lines[1]]))
-        out = _in(mount, np.concatenate([outs[0][:0:-1], outs[1]])) - mount[:3, 3]
-        result["gripper coil"] = coil(line + presets.GRIPPER_OFFSET * out, out, coil_turns(rest), temperature)
+        result[f"ring {number}"] = sweep(line, out - mount[:3, 3], across, *outline, RING)
     return result
 
 
-def site_parts(lowered: float) -> dict[str, Part]:
-    """Return stage, its column and the table; the stage is `lowered` so far [m]."""
+def ring_coil(mount: Array, ring: Gripper, gap: float, temperature: float, winding: Coil = MEASURED_COIL) -> Part:
+    """Return the coil around a ring, see `ring_parts`, at a temperature [degC]."""
+    half, bend = 0.5 * ring.length, _bend(gap / ring.length)
+    turns = winding.turns(ring.rest_length)
+    fine = np.linspace(0.0, half, round(TURN * turns / 2.0) + 1)
+    lines, outs = zip(*(_arc(fine, bend / half, side) for side in (-1.0, 1.0)), strict=True)
+    line = _in(mount, np.concatenate([lines[0][:0:-1], lines[1]]))
+    out = _in(mount, np.concatenate([outs[0][:0:-1], outs[1]])) - mount[:3, 3]
+    return winding.part(line + ring.offset * out, out, turns, temperature)
+
+
+def site_parts(floor: float, lowered: float = 0.0) -> dict[str, Part]:
+    """Return the "stage", `lowered` so far [m], its "column", and the "table" at the depth `floor` [m]."""
     edge, deep, thick = 10e-3, 26e-3, 1.2e-3
-    top = presets.SITE.table
+    half = floor * TABLE_HALF
     return {
         "stage": box(
             np.array([0.0, 0.5 * (edge - deep), lowered - thick - PLATE_THICKNESS]), (edge, 0.5 * (deep + edge), thick), METAL
         ),
-        "column": box(np.array([0.0, -deep, 0.5 * top - 7e-3]), (2.5e-3, 2.5e-3, 0.5 * top + 7e-3), RAIL),
-        "table": box(np.array([0.0, 0.0, top + 1e-3]), (TABLE_HALF, TABLE_HALF, 1e-3), TABLE),
+        "column": box(np.array([0.0, -deep, 0.5 * floor - 7e-3]), (2.5e-3, 2.5e-3, 0.5 * floor + 7e-3), RAIL),
+        "table": box(np.array([0.0, 0.0, floor + 1e-3]), (half, half, 1e-3), TABLE),
     }
-
-
-def coil_turns(rest_length: float) -> float:
-    """Return how often a TCA of that rest length [m] winds around its axis."""
-    pitch_angle = radians(presets.COIL_PITCH_DEG)
-    return rest_length / REFERENCE_LENGTH * presets.FIBRE_LENGTH * cos(pitch_angle) / (2.0 * pi * presets.COIL_RADIUS)
-
-
-def coil(axis: Array, out: Array, turns: float, temperature: float) -> Part:
-    """Return a fibre wound around a line.
-
-    Parameters
-    ----------
-    axis : (k, 3) array
-        The coil's axis, evenly in its turns [m].
-    out : (k, 3) array
-        Directions that are not along the axis, of any length.
-    turns : float
-        How often it winds.
-    temperature : float
-        [degC].
-    """
-    first, second = _around(axis, out)
-    angle = 2.0 * pi * turns * np.linspace(0.0, 1.0, len(axis))[:, np.newaxis]
-    radial = np.cos(angle) * first + np.sin(angle) * second
-    fibre = axis + presets.COIL_RADIUS * radial
-    outline = circle(0.5 * presets.FIBRE_DIAMETER, FIBRE)
-    part = sweep(fibre, *_around(fibre, radial), *outline, BODY)
-    return part._replace(temperature=temperature, axis=axis)
 
 
 def sweep(line: Array, first: Array, second: Array, outline: Array, facing: Array, colour: str) -> Part:
@@ -232,6 +235,13 @@ def sweep(line: Array, first: Array, second: Array, outline: Array, facing: Arra
         colour,
         axis=line,
     )
+
+
+def rod(start: Array, end: Array, radius: float, colour: str) -> Part:
+    """Return a round rod between two poses (4, 4) [m] that face along it."""
+    line = np.stack([start[:3, 3], end[:3, 3]])
+    first, second = (np.broadcast_to(start[:3, i], (2, 3)) for i in (0, 1))
+    return sweep(line, first, second, *circle(radius, CIRCLE), colour)
 
 
 def disc(pose: Array, radius: float, thickness: float, colour: str) -> Part:
@@ -331,50 +341,6 @@ def _bend(share: float) -> float:
         slope = (angle * np.cos(angle) - np.sin(angle)) / angle**2
         angle -= (np.sin(angle) / angle - share) / slope
     return float(angle)
-
-
-def _below(task: Task, record: Record) -> dict[str, Part]:
-    """Return what hangs from the arm's tip."""
-    tip = record.tip[0]
-    if isinstance(task, pick_and_place.PickAndPlace):
-        gap = float(task.gap(record)[0])
-        if record.scene[0, grasp.HELD] + record.scene[0, grasp.ASTRIDE]:
-            gap = max(gap, presets.OBJECT.width)
-        return ring_parts(tip, gap, float(record.temperature[0, 4]))
-    if isinstance(task, twist_align.TwistAlign):
-        return ring_parts(tip, 0.0, None)
-    beyond = tip.copy()  # Reach: twisting module and gripper are a rigid body
-    beyond[:3, 3] += presets.TWISTING_LENGTH * tip[:3, 2]
-    line = np.stack([tip[:3, 3], beyond[:3, 3]])
-    first, second = (np.broadcast_to(tip[:3, i], (2, 3)) for i in (0, 1))
-    body = sweep(line, first, second, *circle(0.5 * presets.BODY_DIAMETER, CIRCLE), DEAD)
-    return {"dead weight": body} | {name: part._replace(colour=DEAD) for name, part in ring_parts(beyond, 0.0, None).items()}
-
-
-def _goal(task: Task, record: Record) -> dict[str, Part]:
-    """Return the goal as a ghost."""
-    goal = record.goal[0]
-    place = 1e-2 * goal[:3]
-    colour = DONE if batch.outcome(task, task.achieved(record)[0], goal).success else GOAL
-    if isinstance(task, pick_and_place.PickAndPlace):
-        ghost = box(place, HALF_OBJECT, colour, turn=float(record.scene[0, grasp.YAW]))
-        spot = np.eye(4)
-        spot[:3, 3] = place[0], place[1], presets.SITE.table - 0.1e-3
-        return {
-            "goal": ghost._replace(opacity=0.55),
-            "goal place": disc(spot, 1e-2 * pick_and_place.SUCCESS_CM, 0.1e-3, colour)._replace(opacity=0.6),
-        }
-    if isinstance(task, twist_align.TwistAlign):
-        pose = np.eye(4)
-        c, s = goal[3:5] / hypot(*goal[3:5])
-        pose[:2, :2] = (c, -s), (s, c)
-        pose[:3, 3] = place
-        ghost_ring = ring_parts(pose, 0.0, None)
-        return {
-            "goal": ball(place, 1e-2 * twist_align.SUCCESS_CM, colour, 0.6),
-            **{f"goal {name}": part._replace(colour=colour, opacity=0.5) for name, part in ghost_ring.items()},
-        }
-    return {"goal": ball(place, 1e-2 * reach.SUCCESS_CM, colour, 0.9), "goal halo": ball(place, PLATE, colour, 0.4)}
 
 
 def heat_colour(temperature: Array | float) -> Array:

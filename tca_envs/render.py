@@ -1,4 +1,4 @@
-"""Pictures of an arm by PyVista: what `geometry` makes of a lane, lit, with a shadow, a colour bar and a readout.
+"""Pictures of an arm by PyVista: what a task shows of a lane, lit, with a shadow, a colour bar and a readout.
 
 Off screen it needs no display, but some OpenGL: that of a graphics driver or Mesa's in software.
 """
@@ -14,10 +14,11 @@ import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
-from tca_envs import batch, geometry, presets
+from tca_envs import geometry
 from tca_envs.geometry import Part
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
-from tca_envs.tasks.core import STEP_S, Core
+from tca_envs.robots.paper import TABLE
+from tca_envs.tasks.core import Core
 from tca_envs.tasks.task import Task
 
 Array = NDArray[np.float64]
@@ -28,15 +29,14 @@ Camera = str | tuple[Point, Point] | NDArray[np.float64]
 SIZE = 480
 """Default width and height of pictures [pixel]."""
 MODES = ("rgb_array", "depth_array", "human")
-FPS = round(1.0 / STEP_S)
-"""Frames per second: a step is shown for as long as it lasts."""
 CAMERAS: Mapping[str, tuple[Point, Point]] = {
     "front": ((70e-3, 270e-3, 10e-3), (0.0, 0.0, 41e-3)),
     "side": ((270e-3, 60e-3, 10e-3), (0.0, 0.0, 39e-3)),
     "above": ((90e-3, 240e-3, -70e-3), (0.0, 0.0, 43e-3)),
     "gripper": ((50e-3, 165e-3, 40e-3), (0.0, 0.0, 65e-3)),
 }
-"""Where cameras stand and at what they look [m] in the base frame with the stage up, z down."""
+"""Where cameras stand and at what they look [m] in the base frame with the stage up, z down: over the paper's table. Over one
+that is deeper they stand further away in proportion, as lamps do."""
 MOST_PIXELS = 4096
 SUN = np.array([0.35, -0.25, 1.0])
 """Direction of the light that casts the shadow, onto the table: (x, y) over z."""
@@ -54,7 +54,13 @@ AMBIENT_LIGHT = {"table": 0.45}
 SHADOWLESS = ("stage", "column", "table")
 HEAT_SCALE = np.linspace(AMBIENT, HARD_LIMIT, 256)
 MM = 1e3
-"""Scenes are in millimetres: VTK's defaults suit numbers of about that size."""
+"""Scenes over the paper's table are in millimetres: VTK's defaults suit numbers of about that size. Others are scaled to it."""
+
+
+def fps(step_s: float) -> float:
+    """Return frames per second at which a step is shown for as long as it lasts [s]; an integer where that is near."""
+    rate = 1.0 / step_s
+    return round(rate) if abs(rate - round(rate)) < 1e-6 * rate else rate
 
 
 def new_renderer(render_mode: Any, width: Any, height: Any, camera: Any, modes: Sequence[str] = MODES) -> "Renderer | None":
@@ -91,9 +97,10 @@ def new_renderer(render_mode: Any, width: Any, height: Any, camera: Any, modes: 
     return Renderer(render_mode, int(width), int(height), place)
 
 
-def _camera(camera: Any) -> tuple[Array, Array]:
+def _camera(camera: Any) -> str | tuple[Array, Array]:
+    """Return the name of a camera, or where it stands and at what it looks [m]."""
     if isinstance(camera, str) and camera in CAMERAS:
-        camera = CAMERAS[camera]
+        return camera
     try:
         stand, target = np.array(camera, dtype=np.float64)
         good = stand.shape == (3,) and bool(np.isfinite([stand, target]).all() and (stand[:2] != target[:2]).any())
@@ -110,7 +117,7 @@ def _camera(camera: Any) -> tuple[Array, Array]:
 class Renderer:
     """Draws lanes of one task, see `new_renderer`. What it holds of OpenGL comes with the first picture, and no copy has it."""
 
-    def __init__(self, mode: str, width: int, height: int, camera: tuple[Array, Array]) -> None:
+    def __init__(self, mode: str, width: int, height: int, camera: str | tuple[Array, Array]) -> None:
         self.mode = mode
         self.size = (width, height)
         self.camera = camera
@@ -124,8 +131,8 @@ class Renderer:
     def render(self, task: Task, core: Core, lane: int = 0) -> Any:
         """Return the picture of a lane, (height, width, 3) uint8 or, as depth, (height, width) float32 [m]; None for a window.
 
-        The depth is the distance from the camera's plane, infinite where nothing is. A window is shown at FPS; what is drawn
-        after a user closed it is lost.
+        The depth is the distance from the camera's plane, infinite where nothing is. A window shows a step for as long as it
+        lasts; what is drawn after a user closed it is lost.
 
         Raises
         ------
@@ -134,9 +141,9 @@ class Renderer:
         """
         if self._scene is not None and self._scene.closed:
             return None
-        parts = geometry.parts(task, core, lane)
+        parts = task.parts(core, lane)
         if self._scene is None:
-            self._scene = _Scene(self.size, self.camera, parts, self.mode)
+            self._scene = _Scene(self.size, self.camera, parts, self.mode, task.ground)
             # PyVista keeps every plotter until it is closed, and many environments never are.
             weakref.finalize(self, self._scene.close).atexit = False
         self._scene.show(parts, readout(task, core, lane))
@@ -145,7 +152,7 @@ class Renderer:
             if step != self._step:  # who draws a step again does not make it longer
                 self._step, self._due = step, max(self._due, time.perf_counter())
                 self._scene.wait(self._due)
-                self._due += 1.0 / FPS
+                self._due += task.step_s
             return None
         return self._scene.depth() if self.mode == "depth_array" else self._scene.image()
 
@@ -159,23 +166,26 @@ class Renderer:
 def readout(task: Task, core: Core, lane: int) -> str:
     """Return what a picture says of a lane: time, temperatures, how far the goal is, success."""
     record = core.record
-    outcome = batch.outcome(task, task.achieved(record)[lane], record.goal[lane])
+    outcome = task.outcome(task.achieved(record)[lane], record.goal[lane])
     measures = []
     for name, value in outcome.measures.items():
-        what, unit = name.rsplit("_", 1)
+        what, _, unit = name.rpartition("_")
         measures.append(f"{what.replace('_', ' ')} {float(value):.1f}{'°' if unit == 'deg' else f' {unit}'}")
     heat = " / ".join(f"{value:.0f}" for value in record.temperature[lane])
     return "\n".join(
-        [f"{STEP_S * int(record.steps[lane]):.1f} s", f"{heat} °C", *measures, "success" if outcome.success else ""]
+        [f"{task.step_s * int(record.steps[lane]):.1f} s", f"{heat} °C", *measures, "success" if outcome.success else ""]
     )
 
 
 class _Scene:
     """A PyVista plotter with an actor for each part; every picture comes with parts of the same names."""
 
-    def __init__(self, size: tuple[int, int], camera: tuple[Array, Array], parts: Mapping[str, Part], mode: str) -> None:
+    def __init__(
+        self, size: tuple[int, int], camera: str | tuple[Array, Array], parts: Mapping[str, Part], mode: str, ground: float
+    ) -> None:
         window, annotated = mode == "human", mode != "depth_array"
         pyvista: Any = importlib.import_module("pyvista")  # takes a second, and its types are too narrow for arrays of 32 bits
+        self.unit, self.ground = MM * (TABLE / ground), ground
         width, height = size if window else (FINER * size[0], FINER * size[1])
         self.plotter = plotter = _plotter(pyvista, (width, height), window)
         self.meshes, self.actors = {}, {}
@@ -198,7 +208,8 @@ class _Scene:
         for place, strength in LIGHTS:
             plotter.add_light(pyvista.Light(position=MM * np.array(place), focal_point=MM * CENTRE, intensity=strength))
         self.text = self._annotated(pyvista, width, height) if annotated else None
-        plotter.camera.position, plotter.camera.focal_point = MM * camera[0], MM * camera[1]
+        stand, target = MM * np.array(CAMERAS[camera]) if isinstance(camera, str) else self.unit * np.array(camera)
+        plotter.camera.position, plotter.camera.focal_point = stand, target
         plotter.camera.up = (0.0, 0.0, -1.0)
         plotter.camera.view_angle = VIEW_DEG
         if window:
@@ -237,13 +248,14 @@ class _Scene:
     def show(self, parts: Mapping[str, Part], text: str) -> None:
         """Draw parts and a readout."""
         for name, part in parts.items():
-            _write(self.meshes[name], MM * part.vertices, part.normals)
+            _write(self.meshes[name], self.unit * part.vertices, part.normals)
             colour = part.colour if part.temperature is None else geometry.heat_colour(part.temperature)
             self.actors[name].prop.color = colour
-        thrown = MM * np.concatenate([parts[name].vertices for name in self.casters])
-        ground = MM * presets.SITE.table - 0.05
+        thrown = self.unit * np.concatenate([parts[name].vertices for name in self.casters])
+        ground = self.unit * self.ground - 0.05
+        edge = self.unit * self.ground * geometry.TABLE_HALF
         thrown[:, :2] += (ground - thrown[:, 2:]) * SUN[:2]
-        np.clip(thrown[:, :2], -MM * geometry.TABLE_HALF, MM * geometry.TABLE_HALF, out=thrown[:, :2])
+        np.clip(thrown[:, :2], -edge, edge, out=thrown[:, :2])
         thrown[:, 2] = ground
         _write(self.shadow, thrown)
         if self.text is not None:
@@ -268,7 +280,7 @@ class _Scene:
         """Return the distances from the camera's plane (height, width) [m]."""
         deep = -self.plotter.get_image_depth(fill_value=-np.inf, reset_camera_clipping_range=False)
         self.plotter.render_window.ReleaseCurrent()
-        return np.ascontiguousarray(deep[::FINER, ::FINER] / MM, dtype=np.float32)
+        return np.ascontiguousarray(deep[::FINER, ::FINER] / self.unit, dtype=np.float32)
 
     def wait(self, until: float) -> None:
         """Let the mouse turn the window until a time of `time.perf_counter`."""

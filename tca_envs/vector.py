@@ -1,6 +1,7 @@
 """The vector environment: N lanes of a task, stepped by one call."""
 
 from collections.abc import Mapping
+from copy import deepcopy
 from typing import Any
 
 import numba
@@ -11,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from tca_envs import batch, presets, render
+from tca_envs import batch, render
 from tca_envs.batch import Observation
 from tca_envs.mechanics import Arm
 from tca_envs.tasks.core import solved
@@ -36,7 +37,7 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     ----------
     num_envs : int
         N.
-    task, reward, split, tolerance
+    task, reward
         As of `tca_envs.env.ArmEnv`.
     max_episode_steps : int, optional
         Episodes are truncated after so many steps; `gymnasium.make_vec` passes that of the registered id. None or -1: never.
@@ -50,11 +51,15 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         "rgb_array" or "depth_array": `render` returns pictures of all lanes. A window is for one arm: `gymnasium.make`.
     width, height, camera
         As of `ArmEnv`.
+    solver : str or function
+        As of `ArmEnv`, but for "shooting", which solves one arm at a time.
+    **arguments
+        Of the task, as of `ArmEnv`.
 
     Raises
     ------
     ValueError
-        If an argument is none of these.
+        If an argument has a value that it cannot have.
     gymnasium.error.DependencyNotInstalled
         If a render mode is asked for and PyVista is missing.
     """
@@ -64,8 +69,6 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         num_envs: int = 1,
         task: str = "reach",
         reward: str = "sparse",
-        split: str = "train",
-        tolerance: float = presets.TOLERANCE,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
@@ -73,6 +76,8 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         width: int = render.SIZE,
         height: int = render.SIZE,
         camera: render.Camera = "front",
+        solver: Any = "collocation",
+        **arguments: Any,
     ) -> None:
         self.num_envs = _count("num_envs", num_envs)
         try:
@@ -82,14 +87,18 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             raise ValueError(f"autoreset_mode = {autoreset_mode!r}: expected one of {expected}") from None
         endless = max_episode_steps is None or max_episode_steps == -1
         self.max_episode_steps = None if endless else _count("max_episode_steps", max_episode_steps)
-        most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # there, but only when it runs
+        most: int = numba.config.NUMBA_NUM_THREADS
         self.threads = most if threads is None else _count("threads", threads, most)
-        self.task = batch.new_task(task, reward, split, tolerance)
+        if solver == "shooting":
+            raise ValueError(
+                f"solver = {solver!r}: expected 'collocation' or a function; shooting solves one arm at a time: gymnasium.make"
+            )
+        self.task = batch.new_task(task, reward, arguments)
         self._renderer = render.new_renderer(render_mode, width, height, camera, PICTURES)
         self.render_mode = render_mode
-        self.metadata = {"render_modes": list(PICTURES), "render_fps": render.FPS, "autoreset_mode": mode}
+        self.metadata = {"render_modes": list(PICTURES), "render_fps": render.fps(self.task.step_s), "autoreset_mode": mode}
         self.reward = reward
-        self.core = self.task.core(self.num_envs)
+        self.core = self.task.core(self.num_envs, batch.new_solver(solver))
         self.core.threads = self.threads
         self.single_action_space = batch.action_space(self.task)
         self.single_observation_space = batch.observation_space(self.task)
@@ -139,7 +148,7 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         return observation, _with_masks(info, mask)
 
     def step(self, actions: NDArray[Any]) -> tuple[Observation, NDArray[np.float64], Mask, Mask, dict[str, Any]]:
-        """Act for 0.1 s in all lanes, but for those that start anew instead; see `gymnasium.vector.VectorEnv.step`.
+        """Act for one step in all lanes, but for those that start anew instead; see `gymnasium.vector.VectorEnv.step`.
 
         Raises
         ------
@@ -231,7 +240,8 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         if name in ("np_random", "np_random_seed"):
             return tuple(getattr(self, name))
         if name == "metadata":
-            return tuple({"render_modes": list(PICTURES), "render_fps": render.FPS} for _ in range(self.num_envs))
+            told = {name: value for name, value in self.metadata.items() if name != "autoreset_mode"}
+            return tuple(deepcopy(told) for _ in range(self.num_envs))
         if name in ("action_space", "observation_space"):
             name = f"single_{name}"
         elif name not in FOR_ALL:
@@ -292,7 +302,7 @@ class ArmVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
     def _start(self, lanes: Lanes) -> None:
         """Put lanes at rest with new goals."""
-        goals, scenes = self.task.draw(self.core, [self._generator(lane) for lane in lanes.tolist()])
+        goals, scenes = self.task.sample(self.core, [self._generator(lane) for lane in lanes.tolist()])
         self.core.reset(lanes, goals, scenes)
 
     def _generator(self, lane: int) -> np.random.Generator:

@@ -1,9 +1,22 @@
 """What several tests need."""
 
+import importlib
 import subprocess
 import sys
 
+import gymnasium
 import pytest
+
+from tca_envs import registry
+
+
+@pytest.fixture
+def toy():
+    """The module toy.py, a user's robot and task, known to the registry for a test."""
+    yield importlib.import_module("toy")
+    for name in registry._ENTRIES.pop("turn").ids.values():
+        gymnasium.registry.pop(name)
+    del sys.modules["toy"]
 
 
 @pytest.fixture(scope="session")

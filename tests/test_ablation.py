@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tca_envs import presets
+from study import __main__ as command
+from study import ablation, effects, pattern
+from study.ablation import ABSENT, FREE, LEFT_OUT, MISSED, NEEDED, SPARE, Row
+from study.effects import AS_IT_IS, COUPLING, EFFECTS, NAMES, Effect
+from study.method import State
+from study.scenes import SCENES, Case
 from tca_envs.mechanics import Arm, Payload
-from tca_envs.study import __main__ as command
-from tca_envs.study import ablation, effects
-from tca_envs.study.ablation import ABSENT, FREE, LEFT_OUT, MISSED, NEEDED, SPARE, Row
-from tca_envs.study.effects import AS_IT_IS, COUPLING, EFFECTS, NAMES, Effect
-from tca_envs.study.method import State
-from tca_envs.study.scenes import SCENES, Case
+from tca_envs.robots import paper
 
 STATES = 6
 COMMON = {effect.name: effect for effect in effects.COMMON}
@@ -39,17 +39,17 @@ def case(arm, drive, payload=None):
 
 def test_the_rest_of_an_arm_has_its_mass_and_centre():
     """Twisting module from 0 to 16 mm, gripper below, centre by hand."""
-    body, tip = effects.rigid_rest(presets.whole_arm())
-    mass = presets.TWISTING_MASS + presets.GRIPPER_MASS
-    gripper = presets.TWISTING_LENGTH + presets.GRIPPER_CENTRE[2]
-    centre = (presets.TWISTING_MASS * 0.5 * presets.TWISTING_LENGTH + presets.GRIPPER_MASS * gripper) / mass
+    body, tip = effects.rigid_rest(paper.whole_arm())
+    mass = paper.TWISTING_MASS + paper.GRIPPER_MASS
+    gripper = paper.TWISTING_LENGTH + paper.GRIPPER_CENTRE[2]
+    centre = (paper.TWISTING_MASS * 0.5 * paper.TWISTING_LENGTH + paper.GRIPPER_MASS * gripper) / mass
     assert body.mass == pytest.approx(mass)
     np.testing.assert_allclose(body.centre, (0.0, 0.0, centre), atol=1e-12)
-    np.testing.assert_allclose(tip[:3, 3], (0.0, 0.0, presets.TWISTING_LENGTH), atol=1e-12)
+    np.testing.assert_allclose(tip[:3, 3], (0.0, 0.0, paper.TWISTING_LENGTH), atol=1e-12)
 
 
 def test_without_coupling_the_arm_is_that_with_a_stiff_cold_rest():
-    whole, payload = presets.whole_arm(), presets.with_object()
+    whole, payload = paper.whole_arm(), paper.with_object()
     bending, twisting = whole.modules
     stiff = Arm([bending, replace(twisting, stiffness=1e6 * twisting.stiffness)], whole.gravity, residual_tolerance=1e-9)
     drive = np.array([100.0, 60.0, 40.0, 25.0])
@@ -61,14 +61,14 @@ def test_without_coupling_the_arm_is_that_with_a_stiff_cold_rest():
 
 
 def test_the_opposite_in_reach_is_the_whole_arm_up_to_the_bending_modules_end():
-    bending, whole = presets.bending_arm(), presets.whole_arm(tolerance=1e-8)
+    bending, whole = paper.bending_arm(), paper.whole_arm(tolerance=1e-8)
     view = only(COUPLING, "reach").complete(case(bending, [120.0, 40.0, 50.0]))
     expected = whole.equilibrium([120.0, 40.0, 50.0, 25.0]).poses([0.045])[0]
     np.testing.assert_allclose(ablation.pose(view), expected, atol=1e-6)
 
 
 def test_muscles_are_left_out_by_the_state_that_is_asked_for():
-    arm = presets.bending_arm()
+    arm = paper.bending_arm()
     warm, cool = np.array([90.0, 41.0, 25.0]), np.array([90.0, 39.0, 25.0])
     for before, now, kept in ((warm, cool, 1), (cool, warm, 2)):
         view = only("cool muscles", "reach").without(Case(State(arm, before), State(arm, now)))
@@ -79,9 +79,9 @@ def test_muscles_are_left_out_by_the_state_that_is_asked_for():
 
 
 def test_states_have_effects_or_not():
-    arm = presets.whole_arm()
+    arm = paper.whole_arm()
     hot, cold = State(arm, np.full(4, 60.0)), State(arm, np.array([60.0, 60.0, 60.0, 25.0]))
-    carrying = replace(hot, payload=presets.with_object())
+    carrying = replace(hot, payload=paper.with_object())
     empty = replace(hot, payload=Payload(arm.payload.mass, arm.payload.centre))
     of = {effect.name: effect.present for effect in EFFECTS["pick-and-place"]}
     for name in ("passive muscles", "cool muscles"):
@@ -90,8 +90,8 @@ def test_states_have_effects_or_not():
 
 
 def test_no_weight_at_the_tip_is_none_of_gripper_and_object():
-    arm = presets.whole_arm()
-    asked = case(arm, [80.0, 25.0, 25.0, 25.0], presets.with_object())
+    arm = paper.whole_arm()
+    asked = case(arm, [80.0, 25.0, 25.0, 25.0], paper.with_object())
     bare = Arm(arm.modules, arm.gravity, residual_tolerance=1e-9).equilibrium(asked.state.drive)
     np.testing.assert_allclose(ablation.pose(COMMON["weight at the tip"].without(asked)), bare.tip_pose, atol=1e-6)
     gripper = Arm(arm.modules, arm.gravity, arm.payload, residual_tolerance=1e-9).equilibrium(asked.state.drive)
@@ -101,8 +101,8 @@ def test_no_weight_at_the_tip_is_none_of_gripper_and_object():
 
 @pytest.mark.parametrize(("name", "strains"), [("shear", slice(3, 5)), ("extension", slice(5, 6))])
 def test_strains_that_are_left_out_are_those_of_the_reference(name, strains):
-    view = COMMON[name].without(case(presets.bending_arm(), [120.0, 25.0, 70.0]))
-    found = ablation.on(ablation.fine(view.now.arm), view.now)
+    view = COMMON[name].without(case(paper.bending_arm(), [120.0, 25.0, 70.0]))
+    found = view.now.on(ablation.fine(view.now.arm))
     strain = found.strain(np.linspace(0.0, 0.045, 5))
     np.testing.assert_allclose(
         strain[:, strains], np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])[strains] * np.ones((5, 1)), atol=1e-5
@@ -128,7 +128,7 @@ def moved(distance, angle, fails=lambda found: False):
 @pytest.fixture(scope="module")
 def some():
     """Cases of the bending module."""
-    return [case(presets.bending_arm(), [T, 40.0, 30.0]) for T in (50.0, 70.0, 90.0, 110.0)]
+    return [case(paper.bending_arm(), [T, 40.0, 30.0]) for T in (50.0, 70.0, 90.0, 110.0)]
 
 
 def test_errors_are_distances_and_yaws(some):
@@ -156,10 +156,11 @@ def test_an_effect_that_no_state_has(some):
     assert row.present == 0 and np.isnan(row.error) and row.verdict == ABSENT
 
 
-def test_what_is_solved_faster_has_a_smaller_ratio(some):
-    """Without weight there is a closed form."""
-    gravity = COMMON["gravity"]
-    complete, without = [gravity.complete(c) for c in some], [gravity.without(c) for c in some]
+def test_what_is_solved_faster_has_a_smaller_ratio():
+    """One module instead of two."""
+    cases = [case(paper.whole_arm(), [T, 40.0, 30.0, T]) for T in (50.0, 70.0, 90.0, 110.0)]
+    coupling = only(COUPLING, "twist-align")
+    complete, without = [coupling.complete(c) for c in cases], [coupling.without(c) for c in cases]
     assert ablation.time_ratio(complete, without, ablation.fine) < 0.5
     assert ablation.time_ratio(without, complete, ablation.fine) > 2.0
 
@@ -190,7 +191,7 @@ def written(tmp_path_factory):
     folder, said = tmp_path_factory.mktemp("effects"), []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ablation, "QUICK", STATES)
-        ablation.run(folder, True, said.append)
+        pattern.run(ablation.STUDY, folder, said.append, quick=True)
     with (folder / "effects.csv").open(encoding="utf-8") as file:
         rows = {(row["scene"], row["effect"]): row for row in csv.DictReader(file)}
     return folder, "\n".join(said), rows
@@ -200,7 +201,7 @@ def test_the_run_writes_every_effect_of_every_scene(written):
     folder, _, rows = written
     assert {path.name for path in folder.iterdir()} == {"effects.png", "effects.csv", "effects.md"}
     assert list(rows) == [(s, name) for s in EFFECTS for name in NAMES if name in {effect.name for effect in EFFECTS[s]}]
-    assert tuple(next(iter(rows.values()))) == ablation.HEADER
+    assert list(next(iter(rows.values()))) == [column.name for column in ablation.COLUMNS if column.name]
     for row in rows.values():
         assert int(row["states"]) == STATES and int(row["unsolved"]) == 0
         if row["verdict"] != ABSENT:
@@ -226,7 +227,7 @@ def test_what_reach_leaves_out_is_less_than_its_success_radius_and_more_than_its
     folder, said, rows = written
     row = rows["reach", COUPLING]
     assert row["verdict"] == MISSED
-    assert presets.TOLERANCE < float(row["p95_error_m"]) <= float(row["max_error_m"]) < ablation.RADIUS["reach"]
+    assert paper.TOLERANCE < float(row["p95_error_m"]) <= float(row["max_error_m"]) < ablation.RADIUS["reach"]
     words = f"{ablation.mm(float(row['max_error_m']))} mm (largest)"
     text = (folder / "effects.md").read_text(encoding="utf-8")
     assert words in text and words in said and "not negligible" in said
@@ -265,8 +266,8 @@ def test_what_cannot_be_drawn_is_told_in_the_figure(row, words):
 
 def test_options_reach_the_study(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(ablation, "run", lambda *arguments: asked.append(arguments))
+    monkeypatch.setattr(pattern, "run", lambda study, out, **options: asked.append((study.name, out, options["quick"])))
     assert (
         command.main(["effects", "--out", str(tmp_path), "--quick"]) == command.main(["effects", "--out", str(tmp_path)]) == 0
     )
-    assert asked == [(tmp_path, True), (tmp_path, False)]
+    assert asked == [("effects", tmp_path, True), ("effects", tmp_path, False)]

@@ -1,5 +1,7 @@
 """Scripted controllers solve their tasks from the observation; `evaluate` counts as documented."""
 
+from types import SimpleNamespace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,22 +10,22 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import tca_envs  # noqa: F401
 from agents.evaluate import MOST_LANES, evaluate, lanes_for, wilson
 from agents.scripted import (
-    BENDING_STARTS,
     PickAndPlaceController,
     RandomPolicy,
     ReachController,
     Sight,
     TwistAlignController,
     plan,
+    starts,
     tip_and_yaw_at,
     tip_at,
     tool_at,
     yaw_gradient,
     yaw_of,
 )
-from tca_envs import presets
 from tca_envs.mechanics import grasp
-from tca_envs.mechanics.rotation import yaw_angle
+from tca_envs.robots import paper
+from tca_envs.rotation import yaw_angle
 
 
 def held_out(name, episodes):
@@ -74,14 +76,14 @@ def test_reach_controller_heats_a_hot_tca_less_and_plans_anew_for_a_new_goal():
 
 
 def test_plan_finds_the_temperatures_of_a_reachable_tip():
-    arm = presets.bending_arm()
+    arm = paper.BENDING.built()
     tip = arm.equilibrium([60.0, 120.0, 30.0]).tip_pose[:3, 3]
-    found = arm.equilibrium(plan(arm, tip_at(tip), BENDING_STARTS)).tip_pose[:3, 3]
+    found = arm.equilibrium(plan(paper.BENDING, tip_at(tip), starts(paper.BENDING))).tip_pose[:3, 3]
     assert np.linalg.norm(found - tip) < 5e-5
 
 
 def test_yaw_gradient_is_that_of_differences():
-    arm = presets.whole_arm()
+    arm = paper.WHOLE.built()
     here = arm.equilibrium([110.0, 60.0, 40.0, 80.0])
     gradient = yaw_gradient(here.tip_pose) @ here.tip_jacobian[3:]
     for i in range(4):
@@ -92,11 +94,11 @@ def test_yaw_gradient_is_that_of_differences():
 
 @pytest.mark.parametrize("aim", ["tip and yaw", "tool", "tool and yaw"])
 def test_jacobians_of_aims_are_those_of_differences(aim):
-    arm = presets.whole_arm()
+    arm = paper.WHOLE.built()
     make = {
         "tip and yaw": tip_and_yaw_at(np.zeros(3), 0.0),
-        "tool": tool_at(np.zeros(2), None),
-        "tool and yaw": tool_at(np.zeros(2), -1.0),
+        "tool": tool_at(paper.GRIPPING, np.zeros(2), None),
+        "tool and yaw": tool_at(paper.GRIPPING, np.zeros(2), -1.0),
     }[aim]
     here = arm.equilibrium([110.0, 60.0, 40.0, 80.0])
     _, jacobian = make(here)
@@ -141,7 +143,7 @@ def test_pick_and_place_goes_through_the_papers_sequence():
     observation, _ = env.reset(seed=1)
     phases = []
     for _ in range(300):
-        phase = controller.phase(Sight.of(observation))
+        phase = controller.phase(Sight.of(observation, controller.task))
         if phases[-1:] != [phase]:
             phases.append(phase)
         observation, *_ = env.step(controller.predict(observation)[0])
@@ -154,9 +156,9 @@ def test_pick_and_place_begins_again_where_the_object_was_lost():
     observation, _ = env.reset(seed=1)
     knocked = False
     for _ in range(300):
-        if not knocked and controller.phase(Sight.of(observation)) == "carry":
+        if not knocked and controller.phase(Sight.of(observation, controller.task)) == "carry":
             scene = env.unwrapped.core.record.scene[0]
-            scene[grasp.HELD], scene[grasp.DROP], scene[grasp.Z] = 0.0, 0.0, grasp.resting(presets.OBJECT, presets.SITE)
+            scene[grasp.HELD], scene[grasp.DROP], scene[grasp.Z] = 0.0, 0.0, grasp.resting(paper.OBJECT, controller.task.site)
             scene[grasp.X] += 2e-3
             env.unwrapped.core.record.payload[:] = env.unwrapped.core.rest.payload
             knocked = True
@@ -169,12 +171,19 @@ def test_what_pick_and_place_sees_is_what_there_is():
     observation, _ = env.reset(seed=1)
     for _ in range(50):
         observation, *_ = env.step(controller.predict(observation)[0])
-        sight, record = Sight.of(observation), env.unwrapped.core.record
+        sight, record = Sight.of(observation, controller.task), env.unwrapped.core.record
         np.testing.assert_allclose(sight.temperature, record.temperature[0], atol=1e-4)
         assert sight.held == (record.scene[0, grasp.HELD] > 0.5)
         assert sight.yaw == pytest.approx(yaw_angle(record.tip[0]), abs=1e-6)
         np.testing.assert_allclose(sight.object, record.scene[0, [grasp.X, grasp.Y, grasp.Z]], atol=1e-7)
         assert np.sin(2.0 * (sight.object_yaw - record.scene[0, grasp.YAW])) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("name", "controller"), [("TCAReach-v0", ReachController), ("TCATwistAlign-v0", TwistAlignController)])
+def test_controllers_solve_a_task_with_another_robot_and_other_steps(toy, name, controller):
+    env = gym.make(name, split="held-out", robot=toy.ROBOT, step_s=0.2, max_episode_steps=50)
+    report = evaluate(controller(env.unwrapped.task), env, 5, seed=7)
+    assert report.success_rate == 1.0
 
 
 def test_a_random_policy_fails_and_repeats():
@@ -231,6 +240,13 @@ def test_success_is_that_of_the_last_step_and_its_time_is_since_when_it_is_held(
     assert report.successes == successes
     assert report.time_to_success_s == pytest.approx(seconds)
     assert (report.episode_return, report.final_distance_mm, report.energy_J) == (-5.0, 5.0, 50.0)
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: SyncVectorEnv([lambda: env])], ids=["single", "batch"])
+def test_time_to_success_counts_in_steps_of_the_task(wrap):
+    env = Countdown((3, 4, 5))
+    env.task = SimpleNamespace(step_s=0.2)
+    assert evaluate(Idle(), wrap(env), 1).time_to_success_s == pytest.approx(0.6)
 
 
 def test_an_episode_that_the_solver_ends_is_no_success():

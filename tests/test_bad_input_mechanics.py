@@ -148,7 +148,7 @@ CASES: dict[tuple[Callable[..., Any], str], list[Any]] = {
     ],
     (arm, "residual_tolerance"): [*NO_NUMBER, 0.0, -1e-9, 1e-13, 0.2],
     (equilibrium, "tip_force"): [*NO_VECTOR, None],
-    (equilibrium, "time_limit_s"): NO_POSITIVE_NUMBER,
+    (equilibrium, "time_limit_s"): [value for value in NO_POSITIVE_NUMBER if value is not None],
     (equilibrium, "tip_moment"): [*NO_VECTOR, None],
     (equilibrium, "payload"): [1e-3, "x", (1e-3, (0.0, 0.0, 0.0)), Payload],
     (equilibrium, "drive"): [(), (0.1, 0.1), ((0.1,),), 0.1, (NAN,), (INF,), (-0.1,), None, "x", ("x",), {}],

@@ -13,13 +13,12 @@ import pytest
 from scipy.stats import spearmanr
 
 import tca_envs  # noqa: F401
-from tca_envs import presets
-from tca_envs.mechanics import Arm, Grid, shooting
-from tca_envs.mechanics.collocation import solve_lanes
+from study import shooting
+from tca_envs.mechanics import Arm, Grid
 from tca_envs.mechanics.discretisation import cost
-from tca_envs.mechanics.kernels import REPORT
+from tca_envs.mechanics.solver import Lanes, solve
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
-from tca_envs.tasks.core import CUT_OFF
+from tca_envs.robots import CUT_OFF, paper
 
 WARM = np.array([110.0, 60.0, 40.0])
 """Temperatures [degC] of the first state; the second is 1 degC hotter everywhere."""
@@ -30,7 +29,7 @@ PAPER_RTOL = 1e-6
 
 @pytest.fixture(scope="module")
 def arm():
-    return presets.bending_arm(tolerance=1e-6)
+    return paper.bending_arm(tolerance=1e-6)
 
 
 @pytest.mark.benchmark(group="warm solve after 1 degC, bending module with the rest of the arm")
@@ -54,7 +53,7 @@ def test_warm_solve_by_the_papers_method(benchmark, arm):
 
 @pytest.fixture(scope="module")
 def whole():
-    return presets.whole_arm(tolerance=1e-6)
+    return paper.whole_arm(tolerance=1e-6)
 
 
 @pytest.mark.benchmark(group="warm solve after 1 degC, whole arm")
@@ -107,21 +106,21 @@ def test_tip_jacobian(benchmark, arm):
 
 def test_the_counted_cost_of_a_grid_follows_the_measured_time():
     """In order, of a warm solve in compiled code; lanes are many and grids take turns, so that noise hardly matters."""
-    module, lanes = presets.bending_module(), 50
+    module, lanes = paper.bending_module(), 50
     grids = [Grid(1, 4), Grid(1, 6), Grid(1, 8), Grid(1, 10), Grid(1, 14), Grid(2, 6), Grid(4, 4), Grid(3, 8)]
-    arms = [Arm([module], presets.GRAVITY, presets.BELOW_BENDING, [grid], 1e-5) for grid in grids]
+    arms = [Arm([module], paper.GRAVITY, paper.BELOW_BENDING, [grid], 1e-5) for grid in grids]
     known = [arm.equilibrium(WARM) for arm in arms]
-    asked, tip, report = np.tile(WARM + 1.0, (lanes, 1)), np.tile(np.eye(4), (lanes, 1, 1)), np.empty((lanes, REPORT))
+    asked, tip = np.tile(WARM + 1.0, (lanes, 1)), np.tile(np.eye(4), (lanes, 1, 1))
     taken = np.empty((40, len(arms)))
     for row in taken:
         for j, (arm, start) in enumerate(zip(arms, known, strict=True)):
             state = (start.nodes[1], start.tensions, *start.known)
             lane = [np.tile(values, (lanes, *[1] * values.ndim)) for values in state]
-            load, lengths = np.tile(start.load, (lanes, 1)), np.empty((lanes, 3))
+            load, known_lanes = np.tile(start.load, (lanes, 1)), Lanes(*lane, tip, np.empty((lanes, 3)))
             begun = time.perf_counter()
-            solve_lanes(arm.model, *lane, asked, load, tip, lengths, report)
+            report = solve(arm.problem, known_lanes, asked, load)
             row[j] = (time.perf_counter() - begun) / lanes
-            assert (report[:, 2] == 2).all()
+            assert (report["iterations"] == 2).all()
     measured, counted = taken.min(axis=0), np.array([cost(module, grid) for grid in grids])
     assert spearmanr(counted, measured).statistic > 0.85
     # More nodes in all, but less to eliminate.
@@ -132,9 +131,9 @@ def test_the_counted_cost_of_a_grid_follows_the_measured_time():
 @pytest.mark.parametrize(
     ("build", "payload", "hottest"),
     [
-        (presets.bending_arm, None, HARD_LIMIT),
-        (presets.whole_arm, None, CUT_OFF),
-        (presets.whole_arm, presets.with_object(), CUT_OFF),
+        (paper.bending_arm, None, HARD_LIMIT),
+        (paper.whole_arm, None, CUT_OFF),
+        (paper.whole_arm, paper.with_object(), CUT_OFF),
     ],
     ids=["bending module", "whole arm", "whole arm with object"],
 )
@@ -153,7 +152,7 @@ def test_the_presets_keep_to_their_tolerance_cold_and_warm(build, payload, hotte
         warm = arm.equilibrium(np.maximum(drive - 1.0, AMBIENT), start=coarse, payload=payload)
         warm_fine = finer.equilibrium(np.maximum(drive - 1.0, AMBIENT), start=fine, payload=payload)
         for a, b in ((coarse, fine), (warm, warm_fine)):
-            assert np.linalg.norm(a.tip_pose[:3, 3] - b.tip_pose[:3, 3]) < presets.TOLERANCE
+            assert np.linalg.norm(a.tip_pose[:3, 3] - b.tip_pose[:3, 3]) < paper.TOLERANCE
 
 
 @pytest.mark.benchmark(group="a picture of 480 x 480 pixels")

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import train
-from agents import benchmark, curve
+from agents import benchmark, curve, training
 from agents.benchmark import Run, each, over_fastest, rows, spread
 from agents.evaluate import Episodes, wilson
-from agents.hyperparameters import DEFAULT_ALGORITHM
+from agents.hyperparameters import default_algorithm
 
 TINY = {
     "env": "TCAReachDense-v0",
@@ -36,10 +36,10 @@ def done(tmp_path_factory):
     """A benchmark with tiny settings, and what it said."""
     out, said = tmp_path_factory.mktemp("benchmark"), []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(benchmark, "HYPERPARAMETERS", SETTINGS)
+        patch.setattr(benchmark, "settings_of", SETTINGS.get)
         patch.setattr(benchmark, "EPISODES", 3)
-        patch.setattr(train, "CURVE_EPISODES", 2)
-        patch.setattr(train, "CURVE_INTERVAL", 60)
+        patch.setattr(training, "CURVE_EPISODES", 2)
+        patch.setattr(training, "CURVE_INTERVAL", 60)
         patch.setattr(curve, "draw", lambda *_: None)  # of each run: takes time
         benchmark.benchmark(out, ["reach"], [0, 1], say=said.append)
         yield out, said
@@ -61,7 +61,7 @@ def test_there_is_a_row_for_each_policy_with_what_its_runs_came_to(done):
     assert 1.0 <= float(scripted["over_fastest"]) < 1.3
     assert scripted["minutes"] == "nan" and float(by_name["ppo"]["minutes"]) > 0.0 and by_name["ppo"]["steps"] == "120"
     assert by_name["random"]["over_fastest"] == "nan"
-    assert [row["policy"] for row in table if row["default"] == "True"] == [DEFAULT_ALGORITHM["reach"]]
+    assert [row["policy"] for row in table if row["default"] == "True"] == [default_algorithm("reach")]
     page = (out / "benchmark.md").read_text(encoding="utf-8")
     assert page.count("100.0 % (61.0-100.0 %)") == 1 and "**PPO**" in page
 
@@ -81,7 +81,7 @@ def test_policies_of_a_seed_meet_the_same_goals_and_other_seeds_others(done):
     out, _ = done
     reports = [json.loads(path.read_text()) for path in sorted(out.glob("runs/*/report.json"))]
     goals = {(report["seed"], report["evaluation_seed"]) for report in reports}
-    assert goals == {(0, train.EVALUATION_SEED), (1, train.EVALUATION_SEED + benchmark.GOALS_APART)}
+    assert goals == {(0, training.EVALUATION_SEED), (1, training.EVALUATION_SEED + benchmark.GOALS_APART)}
     distances = [report["held_out"]["random"]["final_distance_mm"] for report in reports if report["algo"] == "random"]
     assert distances[0] != distances[1]
 

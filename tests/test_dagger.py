@@ -19,7 +19,7 @@ def test_the_network_sees_the_differences():
     observation, _ = env.reset(seed=3)
     for _ in range(4):  # twisted, and not yet there
         observation, *_ = env.step(controller.predict(observation)[0])
-    features = Features(env.observation_space)
+    features = Features(env.observation_space, "pick-and-place")
     batch = {key: torch.as_tensor(np.stack([value, value])) for key, value in observation.items()}
     found = features(batch).numpy()
     assert found.shape == (2, features.features_dim)

@@ -1,26 +1,27 @@
-"""The discretisation that follows from a tolerance and a scene, and the closed form that needs none."""
+"""The discretisation that follows from a tolerance and a scene; without load, against a closed form."""
 
 import time
 from dataclasses import replace
 from itertools import product
 
+import closed_form
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import tca_envs  # noqa: F401
-from tca_envs import presets
 from tca_envs.mechanics import TCA, Arm, Grid, Module, Muscle, Payload, Spring, Tendon, discretisation, discretise
-from tca_envs.mechanics.arm import default_grid, interpolated
+from tca_envs.mechanics.arm import default_grid
+from tca_envs.mechanics.grid import interpolated
 from tca_envs.mechanics.thermal import AMBIENT
-from tca_envs.tasks.core import CUT_OFF
+from tca_envs.robots import CUT_OFF, paper, robot
 
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-8)
-ARMS = {"bending": presets.bending_arm, "whole": presets.whole_arm}
+ARMS = {"bending": paper.bending_arm, "whole": paper.whole_arm}
 
 
 def finer(arm: Arm) -> Arm:
-    """The arm on a grid whose error is next to nothing, below 1e-11 m on the presets."""
+    """The arm on a grid whose error is next to nothing, below 1e-11 m on the paper."""
     grids = [Grid(2 * default_grid(module).elements, 10) for module in arm.modules]
     return Arm(arm.modules, arm.gravity, arm.payload, grids, residual_tolerance=1e-11)
 
@@ -44,7 +45,7 @@ def test_the_tip_stays_within_the_tolerance(name, tolerance):
     """At random temperatures, none of those that decided; the study `tolerance` does this with 2,000 for each task."""
     arm = ARMS[name](tolerance=tolerance)
     drives = np.random.default_rng(7).uniform(AMBIENT, CUT_OFF, (60, len(arm.muscles)))
-    errors = tip_errors(arm, drives, (None, presets.with_object()) if name == "whole" else (None,))
+    errors = tip_errors(arm, drives, (None, paper.with_object()) if name == "whole" else (None,))
     assert (errors <= tolerance).all()
     assert np.median(errors) > 1e-4 * tolerance  # and nothing is wasted
     assert arm.discretisation.error <= tolerance == arm.discretisation.tolerance
@@ -64,7 +65,7 @@ def test_a_looser_tolerance_is_cheaper(name):
 def test_no_grid_that_keeps_to_the_tolerance_is_cheaper():
     """For the bending arm all cheaper ones can be tried: each errs by more than the tolerance over the safety factor."""
     tolerance = 1e-5
-    arm = presets.bending_arm(tolerance=tolerance)
+    arm = paper.bending_arm(tolerance=tolerance)
     (chosen,), (module,) = arm.grids, arm.modules
     drives = np.array([*product((25.0, 160.0), repeat=3), *np.random.default_rng(0).uniform(25.0, 160.0, (60, 3))])
     cheaper = [Grid(e, q) for e in (1, 2, 3) for q in range(3, 9)]
@@ -76,8 +77,8 @@ def test_no_grid_that_keeps_to_the_tolerance_is_cheaper():
 
 
 def test_the_choice_is_the_same_every_time():
-    module = presets.bending_module()
-    arm = Arm([module], presets.GRAVITY, presets.BELOW_BENDING)
+    module = paper.bending_module()
+    arm = Arm([module], paper.GRAVITY, paper.BELOW_BENDING)
     drives = np.random.default_rng(0).uniform(25.0, 160.0, (40, 3))
     first, second = (discretise(arm, 1e-5, drives).discretisation for _ in range(2))
     assert first == second and first.states == 40
@@ -86,13 +87,13 @@ def test_the_choice_is_the_same_every_time():
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 def test_the_choice_takes_less_time_than_two_thousand_solves(tolerance):
     """A fifth of a second where a warm solve of the whole arm takes 100 us: other work on the machine slows both."""
-    arm = presets.whole_arm(tolerance=1e-6)
+    arm = paper.whole_arm(tolerance=1e-6)
     states = [arm.equilibrium(np.full(4, temperature)) for temperature in (80.0, 81.0)]
     chosen, solved = [], []
     for _ in range(4):
-        presets._scene.cache_clear()
+        robot._built.cache_clear()
         begun = time.process_time()
-        presets.whole_arm(tolerance=tolerance)
+        paper.whole_arm(tolerance=tolerance)
         chosen.append(time.process_time() - begun)
         begun = time.process_time()
         for i in range(1000):
@@ -107,13 +108,13 @@ def test_the_environment_says_what_was_chosen():
     (e0, q0), (e1, q1) = env.unwrapped.arm.grids
     assert lines[0] == f"module 0: {e0} x {q0} Gauss nodes" and lines[1] == f"module 1: {e1} x {q1} Gauss nodes"
     error = env.unwrapped.arm.discretisation.error
-    assert lines[-1] == f"tip error: {error:.1e} m estimated from {presets.STATES} states, 1.0e-04 m asked"
-    assert "not estimated" in str(Arm([presets.bending_module()]).discretisation)
+    assert lines[-1] == f"tip error: {error:.1e} m estimated from {robot.STATES} states, 1.0e-04 m asked"
+    assert "not estimated" in str(Arm([paper.bending_module()]).discretisation)
 
 
 def test_few_hard_states_among_many_easy_ones_decide():
     """All TCAs equally hot stretch and shorten the module, which any grid resolves; one state of bending is enough."""
-    arm = Arm([presets.bending_module()], presets.GRAVITY, presets.BELOW_BENDING)
+    arm = Arm([paper.bending_module()], paper.GRAVITY, paper.BELOW_BENDING)
     easy, hard = np.repeat(np.linspace(30.0, 150.0, 60), 3).reshape(-1, 3), np.array([[144.0, 64.0, 78.0]])
     chosen = discretise(arm, 1e-4, np.vstack([easy, hard]))
     assert tip_errors(chosen, hard).max() <= 1e-4
@@ -121,7 +122,7 @@ def test_few_hard_states_among_many_easy_ones_decide():
 
 
 def test_grids_that_miss_together_are_chosen_again_with_half_the_share(monkeypatch):
-    arm = Arm([presets.bending_module()], presets.GRAVITY, presets.BELOW_BENDING)
+    arm = Arm([paper.bending_module()], paper.GRAVITY, paper.BELOW_BENDING)
     drives, shares = np.array([[144.0, 64.0, 78.0], [120.0, 30.0, 90.0]]), []
 
     def cheapest(k, share, fine, residual_tolerance):
@@ -139,7 +140,7 @@ def test_grids_that_miss_together_are_chosen_again_with_half_the_share(monkeypat
 
 def test_states_without_equilibrium_do_not_decide():
     """A rod that is pushed far beyond buckling under a twisting payload may have none in reach; the other states decide."""
-    arm = Arm([presets.bending_module()], presets.GRAVITY, presets.BELOW_BENDING)
+    arm = Arm([paper.bending_module()], paper.GRAVITY, paper.BELOW_BENDING)
     drives = np.random.default_rng(0).uniform(25.0, 160.0, (20, 3))
     loads = np.tile(arm.load(), (21, 1))
     loads[20, 3:6] = 1e6  # a moment that no rod bears
@@ -152,7 +153,7 @@ def test_states_without_equilibrium_do_not_decide():
 
 @pytest.mark.parametrize("tolerance", [0.0, -1e-5, 9e-10, 2e-3, np.nan, np.inf, None, "1e-5", True])
 def test_a_tolerance_out_of_range_is_refused(tolerance):
-    arm = Arm([presets.bending_module()])
+    arm = Arm([paper.bending_module()])
     with pytest.raises(ValueError, match=r"tolerance = .*: expected a finite number in \[1e-09, 0.001\]"):
         discretise(arm, tolerance, [[25.0, 25.0, 25.0]])
 
@@ -170,7 +171,7 @@ def test_a_tolerance_out_of_range_is_refused(tolerance):
     ],
 )
 def test_states_of_the_wrong_kind_are_refused(drives, loads, name):
-    arm = Arm([presets.bending_module()], presets.GRAVITY)
+    arm = Arm([paper.bending_module()], paper.GRAVITY)
     with pytest.raises(ValueError, match=name):
         discretise(arm, 1e-5, drives, loads)
 
@@ -183,7 +184,7 @@ def test_interpolation_between_grids_is_exact_for_polynomials():
     np.testing.assert_allclose(interpolated(here, values, there), expected, atol=1e-14)
 
 
-# Without load: the closed form.
+# Without load there is a closed form.
 
 TWISTED = Muscle(3.5e-3, 0.4, 5.0, TCA())
 
@@ -206,30 +207,24 @@ UNLOADED = {
         [120.0],
     ),
     "no muscle": ([module()], []),
-    "in series": ([presets.bending_module(), presets.twisting_module()], [120.0, 40.0, 30.0, 110.0]),
+    "in series": ([paper.bending_module(), paper.twisting_module()], [120.0, 40.0, 30.0, 110.0]),
 }
 
 
 @pytest.mark.parametrize("case", UNLOADED)
-def test_the_closed_form_is_the_equilibrium_that_collocation_finds(case):
+def test_without_load_collocation_finds_the_closed_form(case):
     modules, drive = UNLOADED[case]
-    arm = Arm(modules)
-    found = arm.equilibrium(drive)
-    assert found.message.startswith("closed form") and found.residual < 1e-9
-    # A push too small to matter makes collocation do it.
-    fine = Arm(modules, grids=[Grid(12, 8)] * len(modules), residual_tolerance=1e-11)
-    integrated = fine.equilibrium(drive, tip_force=(1e-15, 0.0, 0.0))
-    assert not integrated.message.startswith("closed form")
-    np.testing.assert_allclose(found.tip_pose, integrated.tip_pose, atol=1e-10)
-    np.testing.assert_allclose(found.tensions, integrated.tensions, atol=1e-9)
-    np.testing.assert_allclose(found.muscle_lengths, integrated.muscle_lengths, atol=1e-11)
-    s = np.linspace(0.0, arm.length, 9)
-    np.testing.assert_allclose(found.strain(s), integrated.strain(s), atol=1e-5, rtol=1e-5)
+    pose, tensions = closed_form.equilibrium(modules, drive)
+    fine = Arm(modules, grids=[Grid(12, 8)] * len(modules), residual_tolerance=1e-11).equilibrium(drive)
+    np.testing.assert_allclose(fine.tip_pose, pose, atol=1e-10)
+    np.testing.assert_allclose(fine.tensions, tensions, atol=1e-9)
+    default = Arm(modules).equilibrium(drive)
+    np.testing.assert_allclose(default.tip_pose[:3, 3], pose[:3, 3], atol=1e-6 * sum(module.length for module in modules))
 
 
-def test_the_closed_form_warm_starts_and_is_warm_started():
+def test_an_unloaded_arm_warm_starts_and_is_warm_started():
     modules, drive = UNLOADED["in series"]
-    arm = Arm(modules)
+    arm = Arm(modules, residual_tolerance=1e-12)
     cold = arm.equilibrium(drive)
     near = arm.equilibrium(np.add(drive, 2.0), start=cold)
     assert near.converged and near.iterations < arm.equilibrium(np.add(drive, 2.0)).iterations
@@ -239,43 +234,17 @@ def test_the_closed_form_warm_starts_and_is_warm_started():
     np.testing.assert_allclose(back.tip_pose, cold.tip_pose, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"gravity": (0.0, 0.0, 9.81), "payload": Payload(1e-3)},
-        {"tip_force": (0.0, 0.0, 1e-3)},
-        {"tip_moment": (0.0, 1e-6, 0.0)},
-        {"modules": [module(TWISTED, Muscle(3e-3, 0.0, 2.0, TCA()))], "drive": [60.0, 60.0]},
-        {"modules": [module(TWISTED, stiffness=np.array([2e-6, 3e-6, 2e-6, 1.0, 1.0, 2.0]))], "drive": [60.0]},
-        {"modules": [module(TWISTED, reference_strain=np.array([10.0, 0.0, 0.0, 0.0, 0.0, 1.0]))], "drive": [60.0]},
-    ],
-)
-def test_what_loads_the_arm_or_makes_its_strain_vary_is_integrated(changes):
-    modules, drive = changes.get("modules", [module(TWISTED)]), changes.get("drive", [60.0])
-    arm = Arm(modules, changes.get("gravity", (0.0, 0.0, 0.0)), changes.get("payload"))
-    loads = {name: changes[name] for name in ("tip_force", "tip_moment") if name in changes}
-    found = arm.equilibrium(drive, **loads)
-    assert found.converged and not found.message.startswith("closed form")
-
-
-def test_weight_without_gravity_and_gravity_without_weight_load_nothing():
-    for arm in (
-        Arm([module(TWISTED)], payload=Payload(1e-3)),
-        Arm([replace(module(TWISTED), mass_per_length=0.1)]),
-        Arm([module(TWISTED)], (0.0, 0.0, 9.81)),
-    ):
-        assert arm.equilibrium([60.0]).message.startswith("closed form")
-
-
-def test_a_scene_without_load_needs_no_grid():
+def test_a_scene_without_load_gets_a_grid_that_keeps_to_the_tolerance():
     arm = Arm([module(TWISTED)])
     chosen = discretise(arm, 1e-6, [[60.0], [150.0]])
-    assert chosen.grids == arm.grids and chosen.discretisation.error == 0.0
+    assert 0.0 < chosen.discretisation.error <= 1e-6
+    pose, _ = closed_form.equilibrium([*arm.modules], [140.0])
+    assert np.linalg.norm(chosen.equilibrium([140.0]).tip_pose[:3, 3] - pose[:3, 3]) <= 1e-6
 
 
 def test_a_small_change_moves_the_arm_even_at_a_loose_tolerance():
     """Not in jerks: by the first-order answer."""
-    arm = presets.bending_arm(tolerance=1e-3)
+    arm = paper.bending_arm(tolerance=1e-3)
     here = arm.equilibrium([100.0, 60.0, 40.0])
     there = arm.equilibrium([100.01, 60.0, 40.0], start=here)
     moved = there.tip_pose[:3, 3] - here.tip_pose[:3, 3]

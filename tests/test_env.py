@@ -11,11 +11,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-import tca_envs  # noqa: F401
 from tca_envs import batch
-from tca_envs.mechanics import grasp, kernels
+from tca_envs.mechanics import Rung, continuation, grasp
 from tca_envs.mechanics.thermal import HARD_LIMIT, SOFT_LIMIT
-from tca_envs.tasks import core
+from tca_envs.robots import CUT_OFF
 
 IDS = sorted(name for name, spec in gym.registry.items() if "tca_envs" in str(spec.entry_point))
 
@@ -222,7 +221,7 @@ def test_the_cut_off_keeps_every_tca_below_the_hard_limit(env):
     env.reset(seed=0)
     roll(env, np.ones((100, *env.action_space.shape), np.float32))
     temperature = env.unwrapped.core.record.temperature
-    np.testing.assert_allclose(temperature, core.CUT_OFF, rtol=1e-12)
+    np.testing.assert_allclose(temperature, CUT_OFF, rtol=1e-12)
     assert temperature.max() < HARD_LIMIT
 
 
@@ -253,13 +252,15 @@ def test_a_failed_solve_keeps_the_last_good_state_and_truncates(env, monkeypatch
     before = unwrapped.get_state()
     observation, *_ = batch.look(unwrapped.task, unwrapped.core, unwrapped.core.rest_report)
 
-    def without_answer(*arguments):
-        arguments[9][:] = (kernels.FAILED, 1.0, 7, 0, 0)
+    def without_answer(arm, lanes, drive, *rest):
+        report = np.zeros(len(drive), dtype=continuation.REPORT)
+        report["rung"], report["residual"], report["iterations"] = Rung.FAILED, 1.0, 7
+        return report
 
-    monkeypatch.setattr(core.ladder, "solve", without_answer)
+    monkeypatch.setattr(unwrapped.core, "solve", without_answer)
     after, reward, terminated, truncated, info = unwrapped.step(np.ones(env.action_space.shape, np.float32))
     assert (terminated, truncated) == (False, True)
-    assert info["solver"] == {"converged": False, "residual": 1.0, "iterations": 7, "rung": kernels.FAILED, "jumped": False}
+    assert info["solver"] == {"converged": False, "residual": 1.0, "iterations": 7, "rung": Rung.FAILED, "jumped": False}
     assert np.isfinite(reward)
     for key in observation:
         assert observation[key][0].tobytes() == after[key].tobytes()
@@ -315,7 +316,7 @@ def test_every_lane_of_a_batch_equals_the_single_environment_bitwise(name):
     task = env.task
     many, rng = task.core(7), np.random.default_rng(0)
     singles = [task.core(1) for _ in range(7)]
-    goals, scenes = task.draw(many, rng.spawn(7))
+    goals, scenes = task.sample(many, rng.spawn(7))
     many.reset(np.arange(7), goals, scenes)
     for i, single in enumerate(singles):
         single.reset(np.array([0]), goals[i : i + 1], scenes[i : i + 1])
@@ -324,7 +325,7 @@ def test_every_lane_of_a_batch_equals_the_single_environment_bitwise(name):
         report = task.step(many, command)
         for i, single in enumerate(singles):
             alone = task.step(single, command[i : i + 1])
-            assert alone.tobytes() == report[i : i + 1].tobytes()
+            assert alone.tolist() == report[i : i + 1].tolist()
             seen, seen_alone = batch.look(task, many, report)[0], batch.look(task, single, alone)[0]
             assert all(seen_alone[key].tobytes() == seen[key][i : i + 1].tobytes() for key in seen)
             assert single.record.strain.tobytes() == many.record.strain[i : i + 1].tobytes()

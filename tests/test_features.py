@@ -7,7 +7,7 @@ import torch
 
 import tca_envs  # noqa: F401
 from agents.features import Features
-from agents.hyperparameters import HYPERPARAMETERS, for_learner
+from agents.hyperparameters import for_learner, settings_of
 from agents.policies import learner
 from agents.sb3 import make
 
@@ -18,7 +18,7 @@ def test_ways_left_are_added_plainly_and_sharply(task):
     observation, _ = env.reset(seed=1)
     for _ in range(5):
         observation, *_ = env.step(np.ones(env.action_space.shape, np.float32))
-    features = Features(env.observation_space)
+    features = Features(env.observation_space, task)
     found = features({key: torch.as_tensor(value[None]) for key, value in observation.items()}).numpy()[0]
     assert found.shape == (features.features_dim,)
     achieved, desired = (observation[key].astype(float) for key in ("achieved_goal", "desired_goal"))
@@ -33,7 +33,7 @@ def test_ways_left_are_added_plainly_and_sharply(task):
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
 def test_policies_are_shown_them_and_are_saved_with_them(algorithm, tmp_path):
-    made = for_learner({**HYPERPARAMETERS["reach"][algorithm], "n_envs": 64})
+    made = for_learner({**settings_of("reach")[algorithm], "n_envs": 64})
     model = learner(algorithm)(env=make("TCAReachDense-v0", 64), **made)
     model.save(tmp_path / "policy.zip")
     again = learner(algorithm).load(tmp_path / "policy.zip")

@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import tca_envs  # noqa: F401
-from tca_envs import presets
-from tca_envs.mechanics import grasp, kernels
+from tca_envs.mechanics import Rung, continuation, grasp
 from tca_envs.mechanics.grasp import ALONG, ASTRIDE, DROP, HELD, LOW, SCENE, STAGE, YAW, Box, Site, X, Y, Z
-from tca_envs.tasks import core
+from tca_envs.robots import paper
 
 same = settings(max_examples=50, deadline=None, derandomize=True)
 
@@ -589,7 +588,7 @@ class Hand:
         self.env = made.unwrapped
         state = self.env.get_state()
         tip = state["tip"][0]
-        self.under = tip[:2, 3] + presets.JAW_DEPTH * tip[:2, 2]
+        self.under = tip[:2, 3] + paper.JAW_DEPTH * tip[:2, 2]
         state["scene"][0, [X, Y, YAW]] = *np.add(self.under, [x, y]), self.yaw + yaw
         state["goal"][0, :3] = 100.0 * np.array([*self.under, REST])
         self.env.set_state(state)
@@ -620,7 +619,7 @@ class Hand:
     @property
     def tool(self):
         tip = self.record.tip[0]
-        return tip[:3, 3] + presets.JAW_DEPTH * tip[:3, 2]
+        return tip[:3, 3] + paper.JAW_DEPTH * tip[:3, 2]
 
 
 def test_jaws_that_close_on_nothing_hold_nothing(made):
@@ -629,20 +628,20 @@ def test_jaws_that_close_on_nothing_hold_nothing(made):
     hand.pick()
     assert not hand.scene[[HELD, ASTRIDE]].any()
     np.testing.assert_array_equal(hand.scene[X : YAW + 1], place)
-    assert hand.record.payload[0, 0] == presets.GRIPPER_MASS
+    assert hand.record.payload[0, 0] == paper.GRIPPER_MASS
     assert hand.observation["observation"][17] == 0.0  # pinch force
 
 
 def test_closed_jaws_come_to_rest_on_the_object(made):
     hand = Hand(made).do(15, stage=DOWN)
-    top = presets.SITE.table - presets.OBJECT.height
+    top = paper.TABLE - paper.OBJECT.height
     assert hand.tool[2] + hand.scene[STAGE] == pytest.approx(top, abs=1e-12)
     assert not hand.scene[[HELD, ASTRIDE]].any()
     stage = hand.scene[STAGE]
     hand.do(10, stage=DOWN)
     assert hand.scene[STAGE] == pytest.approx(stage, abs=1e-6)
     free = Hand(made, x=20e-3).do(15, stage=DOWN)
-    assert free.tool[2] + free.scene[STAGE] == pytest.approx(presets.SITE.table, abs=1e-12)
+    assert free.tool[2] + free.scene[STAGE] == pytest.approx(paper.TABLE, abs=1e-12)
 
 
 def test_a_held_object_hangs_from_the_arm(made):
@@ -654,10 +653,10 @@ def test_a_held_object_hangs_from_the_arm(made):
     assert sin(hand.scene[YAW] - hand.yaw) == pytest.approx(0.0, abs=1e-9)
     # Gripper and box together, where they are (the frame of the tip is that of the raised base, and hardly tilted).
     mass, *centre = hand.record.payload[0]
-    assert mass == pytest.approx(presets.GRIPPER_MASS + presets.OBJECT.mass)
+    assert mass == pytest.approx(paper.GRIPPER_MASS + paper.OBJECT.mass)
     tip, raised = hand.record.tip[0], [0.0, 0.0, hand.scene[STAGE]]
-    ring = tip[:3, :3] @ presets.GRIPPER_CENTRE + tip[:3, 3]
-    together = presets.GRIPPER_MASS * ring + presets.OBJECT.mass * (hand.scene[X : Z + 1] - raised)
+    ring = tip[:3, :3] @ paper.GRIPPER_CENTRE + tip[:3, 3]
+    together = paper.GRIPPER_MASS * ring + paper.OBJECT.mass * (hand.scene[X : Z + 1] - raised)
     np.testing.assert_allclose(tip[:3, :3] @ centre + tip[:3, 3], together / mass, atol=6e-5)
     assert abs(hand.scene[ALONG]) > 0.8e-3 and hand.scene[DROP] < -1.5e-3
     # 15 mN stretch a 61 mm arm of EA = 2 N by 0.45 mm; its coils help to carry it.
@@ -665,7 +664,7 @@ def test_a_held_object_hangs_from_the_arm(made):
     *place, _, _, _, opening, pinch, x, y, z, _, _ = hand.observation["observation"][10:]
     np.testing.assert_allclose(place, 100.0 * (hand.tool + raised), rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose([x, y, z], 100.0 * hand.scene[X : Z + 1], rtol=1e-6, atol=1e-6)
-    assert opening == pytest.approx(100.0 * presets.OBJECT.width)
+    assert opening == pytest.approx(100.0 * paper.OBJECT.width)
     assert 0.05 * pinch > NEEDED
 
 
@@ -677,7 +676,7 @@ def test_what_is_put_down_at_the_target_is_placed(made):
     hand.do(25, ring=HEAT)
     assert hand.scene[[HELD, ASTRIDE]].tolist() == [0.0, 1.0]
     assert not hand.info["is_success"]  # the gripper is around it
-    assert hand.record.payload[0, 0] == presets.GRIPPER_MASS
+    assert hand.record.payload[0, 0] == paper.GRIPPER_MASS
     hand.do(10, ring=HEAT, stage=UP)
     assert not hand.scene[[HELD, ASTRIDE]].any()
     assert hand.info["is_success"] and hand.reward == 0.0
@@ -698,17 +697,19 @@ def test_the_tabulated_pinch_is_that_of_the_ring(made):
     heats = np.linspace(25.0, 158.0, 38)
     record = task.core(len(heats)).record
     record.temperature[:, 4] = heats
-    np.testing.assert_allclose(task.pinch(record), task.gripper.pinch(heats, presets.OBJECT.width), atol=3e-4)
+    np.testing.assert_allclose(task.pinch(record), task.gripper.ring.pinch(heats, paper.OBJECT.width), atol=3e-4)
 
 
 def test_without_an_equilibrium_nothing_moves(made, monkeypatch):
     hand = Hand(made).pick()
     before = hand.env.get_state()
 
-    def without_answer(*arguments):
-        arguments[9][:] = (kernels.FAILED, 1.0, 7, 0, 0)
+    def without_answer(arm, lanes, drive, *rest):
+        report = np.zeros(len(drive), dtype=continuation.REPORT)
+        report["rung"], report["residual"], report["iterations"] = Rung.FAILED, 1.0, 7
+        return report
 
-    monkeypatch.setattr(core.ladder, "solve", without_answer)
+    monkeypatch.setattr(hand.env.core, "solve", without_answer)
     *_, truncated, _ = hand.env.step(np.ones(6, dtype=np.float32))
     assert truncated
     after = hand.env.get_state()

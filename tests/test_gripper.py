@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, root
 
-from tca_envs import presets
 from tca_envs.mechanics import TCA, Gripper, Spring, Tendon
+from tca_envs.robots import paper
 
 same = settings(max_examples=50, deadline=None, derandomize=True)
 
-HARDWARE, PAPER = presets.gripper(), presets.gripper(TCA.paper())
+HARDWARE, PAPER = paper.ring(), paper.ring(TCA.paper())
 SETS = pytest.mark.parametrize("ring", [HARDWARE, PAPER], ids=["hardware", "paper"])
 HEATS = np.array([25.0, 40.0, 60.0, 90.0, 110.0, 130.0, 158.0])
-WIDTH = presets.OBJECT.width
+WIDTH = paper.OBJECT.width
 temperatures = st.floats(25.0, 158.0)
 
 
@@ -190,7 +190,7 @@ def test_pinch_vanishes_continuously_where_the_jaws_leave_the_object(ring, width
 
 def test_the_object_is_held_cold_and_let_go_hot():
     """The board's weight takes 6.7 mN of each jaw."""
-    needed = presets.OBJECT.mass * 9.81 / (2.0 * presets.OBJECT.friction)
+    needed = paper.OBJECT.mass * 9.81 / (2.0 * paper.OBJECT.friction)
     assert HARDWARE.pinch(25.0, WIDTH) > 4.0 * needed
     assert HARDWARE.pinch(100.0, WIDTH) > needed
     assert HARDWARE.pinch(120.0, WIDTH) < needed
@@ -308,6 +308,6 @@ def test_a_law_that_is_no_tca_is_refused(bad):
 
 
 def test_a_gripper_is_a_value():
-    assert presets.gripper() == HARDWARE != PAPER
+    assert paper.ring() == HARDWARE != PAPER
     with pytest.raises(AttributeError):
         HARDWARE.length = 1.0

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tca_envs.mechanics import TCA, Spring, Tendon
-from tca_envs.mechanics.muscle import elongation
+from tca_envs.mechanics.laws import elongation
 
 # The same examples in every run: a verdict on the code, not on the draw.
 same = settings(max_examples=100, deadline=None, derandomize=True)

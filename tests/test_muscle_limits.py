@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from tca_envs.mechanics import TCA, Arm, Equilibrium, Module, Muscle, Tendon
-from tca_envs.presets import bending_arm, gripper, whole_arm, with_object
-from tca_envs.tasks.core import CUT_OFF
+from tca_envs.robots import CUT_OFF
+from tca_envs.robots.paper import bending_arm, ring, whole_arm, with_object
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def test_no_coil_of_a_task_closes(name, equilibria):
 
 
 def test_the_grippers_coil_stays_open():
-    half = gripper().half()
+    half = ring().half()
     lengths = [half.equilibrium([temperature]).muscle_lengths[0] for temperature in (AMBIENT, 100.0, CUT_OFF)]
     assert 0.643 < 0.85 < min(lengths) / half.rest_lengths[0]
 

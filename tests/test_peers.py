@@ -7,10 +7,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tca_envs import presets
+from study.method import Method, State
+from study.methods import METHODS, elastica, gvs
 from tca_envs.mechanics import TCA, Arm, Equilibrium, Grid, Module, Muscle, Spring, Tendon, muscle
-from tca_envs.study.method import Method, State
-from tca_envs.study.methods import METHODS, elastica, gvs
+from tca_envs.robots import paper
 
 PEERS = (elastica.METHOD, elastica.MATCHED, gvs.METHOD)
 HOT = np.array([110.0, 40.0, 25.0])
@@ -19,7 +19,7 @@ HOT = np.array([110.0, 40.0, 25.0])
 
 def bending(muscles: bool = True, gravity=(0.0, 0.0, 0.0)) -> Arm:
     """The bending module alone, on a fine grid."""
-    module = presets.bending_module()
+    module = paper.bending_module()
     if not muscles:
         module = Module(module.length, module.stiffness, module.mass_per_length)
     return Arm([module], gravity, grids=[Grid(4, 8)], residual_tolerance=1e-10)
@@ -52,7 +52,7 @@ def hot_tip(method: Method, setting: int):
 
 
 def test_nothing_is_imported_before_a_method_is_built():
-    code = "import sys, tca_envs.study.methods; print({'elastica', 'soromox', 'jax'} & set(sys.modules))"
+    code = "import sys, study.methods; print({'elastica', 'soromox', 'jax'} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "set()"
 
 
@@ -106,7 +106,7 @@ def test_the_packages_own_law_has_another_limit(rods):
 
 
 def test_relaxed_rod_carries_payload_weight_and_a_second_helical_module(rods):
-    arm = presets.whole_arm()
+    arm = paper.whole_arm()
     drive = [110.0, 60.0, 40.0, 90.0]
     distance, turn = error(elastica.MATCHED, 10, arm, drive)
     assert distance < 4e-4
@@ -115,13 +115,13 @@ def test_relaxed_rod_carries_payload_weight_and_a_second_helical_module(rods):
 
 @pytest.mark.parametrize("law, drive", [(Tendon(), 0.05), (Spring(20.0), 0.035)])
 def test_relaxed_rod_takes_the_other_laws(rods, law, drive):
-    module = presets.bending_module()
+    module = paper.bending_module()
     arm = Arm([Module(module.length, module.stiffness, 0.0, [Muscle(0.004, 0.3, 0.2, law)])])
     assert error(elastica.MATCHED, 20, arm, [drive])[0] < 2e-4
 
 
 def test_relaxation_goes_on_from_its_own_answer_and_from_an_equilibrium(rods):
-    arm = presets.bending_arm()
+    arm = paper.bending_arm()
     before, after = State(arm, HOT), State(arm, HOT + 1.0)
     solver = elastica.MATCHED.build(arm, 10, [before])
     cold = solver.solve(after, solver.cold())
@@ -206,7 +206,7 @@ def test_strain_series_report_what_they_do_not_find(strains):
 @pytest.mark.slow
 def test_strain_series_carry_payload_weight_and_a_second_helical_module(strains):
     # The arm's own grid is good for 10 um.
-    distance, turn = error(gvs.METHOD, 3, presets.whole_arm(), [110.0, 60.0, 40.0, 90.0])
+    distance, turn = error(gvs.METHOD, 3, paper.whole_arm(), [110.0, 60.0, 40.0, 90.0])
     assert distance < 1.5e-5
     assert turn < 0.01
 
@@ -214,7 +214,7 @@ def test_strain_series_carry_payload_weight_and_a_second_helical_module(strains)
 @pytest.mark.slow
 @pytest.mark.parametrize("law, drive", [(Tendon(), 0.05), (Spring(20.0), 0.035)])
 def test_strain_series_take_the_other_laws(strains, law, drive):
-    module = presets.bending_module()
+    module = paper.bending_module()
     arm = Arm([Module(module.length, module.stiffness, 0.0, [Muscle(0.004, 0.3, 0.2, law)])])
     assert error(gvs.METHOD, 3, arm, [drive])[0] < 1e-5
 

@@ -4,16 +4,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import tca_envs  # noqa: F401
+from tca_envs import registry
 from tca_envs.mechanics import thermal
 from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT
 from tca_envs.tasks.core import STEP_S
-from tca_envs.tasks.reach import Reach
 from tca_envs.tasks.task import held_out
 
 
 def test_a_goal_is_the_tip_that_steady_powers_reach():
-    task = Reach("train")
+    task = registry.entry("reach").new()
     core = task.core(1)
     rng = np.random.default_rng(0)
     for _ in range(10):
@@ -29,13 +28,13 @@ def test_a_goal_is_the_tip_that_steady_powers_reach():
 
 def test_splits_are_a_fifth_and_disjoint():
     rng = np.random.default_rng(0)
-    share = np.mean([held_out(rng.uniform(AMBIENT, SOFT_LIMIT, 3)) for _ in range(20_000)])
+    share = np.mean([held_out(rng.uniform(AMBIENT, SOFT_LIMIT, 3), AMBIENT) for _ in range(20_000)])
     assert share == pytest.approx(0.2, abs=0.02)
 
 
 @pytest.mark.parametrize("split", ["train", "held-out"])
 def test_goals_come_from_their_split(split, monkeypatch):
-    task = Reach(split)
+    task = registry.entry("reach").new(split=split)
     core = task.core(1)
     drawn = []
     settle = core.settle
@@ -45,16 +44,16 @@ def test_goals_come_from_their_split(split, monkeypatch):
         return settle(temperature)
 
     monkeypatch.setattr(core, "settle", remember)
-    task.draw(core, np.random.default_rng(0).spawn(30))
+    task.sample(core, np.random.default_rng(0).spawn(30))
     assert 30 <= len(drawn) <= 32  # where an arm could buckle, another one is drawn
-    assert all(held_out(temperature) == (split == "held-out") for temperature in drawn)
+    assert all(held_out(temperature, AMBIENT) == (split == "held-out") for temperature in drawn)
 
 
 def test_held_out_goals_lie_apart_from_training_goals():
     """The nearest training goal of a grid is typically half a success radius away or more: a split for interpolation."""
-    core = Reach("train").core(1)
+    core = registry.entry("reach").new().core(1)
     grid = np.stack(np.meshgrid(*[AMBIENT + 6.25 + 12.5 * np.arange(10)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    held = np.array([held_out(temperature) for temperature in grid])
+    held = np.array([held_out(temperature, AMBIENT) for temperature in grid])
     tips = core.settle(grid)[0].tip[:, :3, 3]
     nearest = [np.linalg.norm(tips[~held] - tip, axis=1).min() for tip in tips[held]]
     assert np.median(nearest) > 5e-4

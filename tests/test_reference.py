@@ -7,11 +7,11 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from study.method import State
+from study.reference import SETTLED, Guess, NoReference, carry, jacobian, mismatch, reference, segments
+from study.wrench import RK4, RK8, STATE, rod
 from tca_envs.mechanics import TCA, Arm, Grid, Module, Muscle, Payload, Spring, Tendon, section
-from tca_envs.presets import BELOW_BENDING, GRAVITY, bending_arm, bending_module, whole_arm
-from tca_envs.study.method import State
-from tca_envs.study.reference import SETTLED, Guess, NoReference, carry, jacobian, mismatch, reference, segments
-from tca_envs.study.wrench import RK4, RK8, STATE, rod
+from tca_envs.robots.paper import BELOW_BENDING, GRAVITY, bending_arm, bending_module, whole_arm
 
 E, G, LENGTH, RADIUS, DENSITY = 0.125e6, 0.125e6 / 3.0, 0.045, 0.0045, 1070.0
 AREA = np.pi * RADIUS**2
@@ -170,7 +170,7 @@ def test_order(tableau, steps, order):
         cut = rod(arm, method, [n, 3 * n], SETTLED)
         result, none = np.empty((2, STATE + 3)), np.empty((2, 0, 9))
         station = np.array([0, n * len(method.b)])
-        assert carry(cut, np.arange(2), station, cut.steps, start, strains.copy(), tension, load, result, none)
+        assert carry(arm.model, cut, np.arange(2), station, cut.steps, start, strains.copy(), tension, load, result, none)
         return result[:, :11]  # of the second module's paths there is one
 
     exact = ends(RK8, 40)
@@ -191,7 +191,7 @@ def test_jacobian():
     count = len(cut.module)
     starts = np.zeros((count, STATE))
     starts[:, 0], starts[:, 7:10] = 1.0, rng.normal(size=(count, 3)) * cut.unit
-    strains = cut.rod.reference[cut.module]
+    strains = cut.arm.reference[cut.module]
     tension = rng.uniform(0.02, 0.1, 5)
 
     def at(step):

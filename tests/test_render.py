@@ -18,12 +18,16 @@ from gymnasium.error import DependencyNotInstalled
 from gymnasium.utils.env_checker import check_env
 
 import tca_envs  # noqa: F401
-from tca_envs import geometry, presets, render
+from tca_envs import geometry, render
 from tca_envs.mechanics import grasp
+from tca_envs.robots import paper
 
 IDS = ("TCAReach-v0", "TCATwistAlign-v0", "TCAPickAndPlace-v0")
 ALL = sorted(name for name, spec in gym.registry.items() if "tca_envs" in str(spec.entry_point))
 SIDE = 160
+
+
+COIL = geometry.Coil()
 
 
 def hot(name, steps=12, seed=3, power=(0.8, -1.0, -0.2, 0.4, 0.6, 0.5), **options):
@@ -36,7 +40,7 @@ def hot(name, steps=12, seed=3, power=(0.8, -1.0, -0.2, 0.4, 0.6, 0.5), **option
 
 
 def parts(env):
-    return geometry.parts(env.unwrapped.task, env.unwrapped.core)
+    return env.unwrapped.task.parts(env.unwrapped.core)
 
 
 def lowered(env):
@@ -70,12 +74,12 @@ def test_body_and_coils_lie_where_the_solver_has_them(name):
         expected = poses[:, :3, 3] + lowered(env)
         assert np.abs(tube.axis - expected).max() < 1e-7
         rings = tube.vertices[: geometry.RINGS * geometry.CIRCLE].reshape(geometry.RINGS, -1, 3) - expected[:, np.newaxis]
-        assert np.abs(np.linalg.norm(rings, axis=2) - presets.BODY_DIAMETER / 2).max() < 1e-7
+        assert np.abs(np.linalg.norm(rings, axis=2) - paper.BODY_DIAMETER / 2).max() < 1e-7
         assert np.abs(np.einsum("kmi,ki->km", rings, poses[:, :3, 2])).max() < 1e-7  # in the cross sections
         for muscle in module.muscles:
             axis = shown[f"coil {number}"].axis
             for end, fraction in ((0, 0.0), (-1, 1.0)):
-                x, y = module.route(muscle, fraction)[:2]
+                x, y = muscle.route(module.length, fraction)[:2]
                 pose = poses[end]
                 assert np.abs(axis[end] - (pose @ [x, y, 0.0, 1.0])[:3] - lowered(env)).max() < 1e-7
             # What is drawn is as long as what is solved.
@@ -89,7 +93,7 @@ def test_body_and_coils_lie_where_the_solver_has_them(name):
 
 
 def test_poses_are_those_that_equilibrium_samples_strains_at():
-    arm = presets.whole_arm(tolerance=1e-9)
+    arm = paper.whole_arm(tolerance=1e-9)
     equilibrium = arm.equilibrium([80.0, 30.0, 50.0, 90.0])
     s = np.sort(np.random.default_rng(0).uniform(0.0, arm.length, 40))
     h = 1e-6
@@ -106,33 +110,36 @@ def test_coils_are_fibres_of_their_length_around_their_axis():
         coil = parts(env)[f"coil {number}"]
         rings = coil.vertices[: len(coil.axis) * geometry.FIBRE].reshape(len(coil.axis), -1, 3)
         away = np.linalg.norm(rings.mean(axis=1) - coil.axis, axis=1)
-        assert np.abs(away - presets.COIL_RADIUS).max() < 1e-9
+        assert np.abs(away - COIL.radius).max() < 1e-9
         thick = np.linalg.norm(rings - rings.mean(axis=1, keepdims=True), axis=2)
-        assert np.abs(thick - presets.FIBRE_DIAMETER / 2).max() < 1e-9
+        assert np.abs(thick - COIL.fibre_diameter / 2).max() < 1e-9
         assert (len(coil.axis) - 1) / geometry.TURN == pytest.approx(count, abs=0.2)
     straight = np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, 45e-3], 2001)
-    cold = geometry.coil(straight, np.tile([1.0, 0.0, 0.0], (2001, 1)), geometry.coil_turns(45e-3), 25.0)
+    winding = geometry.Coil()
+    cold = winding.part(straight, np.tile([1.0, 0.0, 0.0], (2001, 1)), winding.turns(45e-3), 25.0)
     fibre = cold.vertices[: 2001 * geometry.FIBRE].reshape(2001, -1, 3).mean(axis=1)
-    assert np.linalg.norm(np.diff(fibre, axis=0), axis=1).sum() == pytest.approx(presets.FIBRE_LENGTH, rel=2e-3)
-    assert pytest.approx(0.53e-3, rel=0.01) == presets.FIBRE_DIAMETER
+    assert np.linalg.norm(np.diff(fibre, axis=0), axis=1).sum() == pytest.approx(COIL.fibre_length, rel=2e-3)
+    assert pytest.approx(0.53e-3, rel=0.01) == COIL.fibre_diameter
 
 
 @pytest.mark.parametrize("temperature", [25.0, 90.0, 110.0, 125.0, 150.0])
 def test_the_ring_is_as_long_as_it_is_and_opens_by_its_gap(temperature):
-    gap = float(presets.gripper().gap(temperature))
+    gap = float(paper.ring().gap(temperature))
     mount = np.eye(4)
     mount[:3, :3] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     mount[:3, 3] = 1e-3, 2e-3, 60e-3
-    shown = geometry.ring_parts(mount, gap, temperature)
+    section = (paper.GRIPPER_THICKNESS, paper.GRIPPER_WIDTH)
+    shown = geometry.ring_parts(mount, paper.ring(), section, gap)
+    shown["gripper coil"] = geometry.ring_coil(mount, paper.ring(), gap, temperature)
     jaws = [shown[f"ring {i}"].axis[-1] for i in (0, 1)]
     assert jaws[1] - jaws[0] == pytest.approx([0.0, gap, 0.0], abs=1e-9)  # along the mount's x axis
     for i in (0, 1):
         line = shown[f"ring {i}"].axis
         assert line[0] == pytest.approx(mount[:3, 3])
-        assert np.linalg.norm(np.diff(line, axis=0), axis=1).sum() == pytest.approx(presets.GRIPPER_LENGTH / 2, rel=2e-3)
-    assert 0.99 * presets.JAW_DEPTH < jaws[0][2] - 60e-3 < presets.JAW_DEPTH + 1.4e-3
+        assert np.linalg.norm(np.diff(line, axis=0), axis=1).sum() == pytest.approx(paper.GRIPPER_LENGTH / 2, rel=2e-3)
+    assert 0.99 * paper.JAW_DEPTH < jaws[0][2] - 60e-3 < paper.JAW_DEPTH + 1.4e-3
     away = shown["gripper coil"].axis[:, np.newaxis] - np.concatenate([shown["ring 0"].axis, shown["ring 1"].axis])
-    assert np.linalg.norm(away, axis=2).min(axis=1) == pytest.approx(presets.GRIPPER_OFFSET, rel=0.02)
+    assert np.linalg.norm(away, axis=2).min(axis=1) == pytest.approx(paper.GRIPPER_OFFSET, rel=0.02)
 
 
 def test_gripper_object_and_stage_follow_the_scene():
@@ -147,14 +154,14 @@ def test_gripper_object_and_stage_follow_the_scene():
         scene = record.scene[0]
         around = shown["object"].vertices
         assert around.mean(axis=0) == pytest.approx(scene[grasp.X : grasp.Z + 1], abs=1e-9)
-        assert np.ptp(around[:, 2]) == pytest.approx(presets.OBJECT.height)
-        assert np.linalg.norm(np.ptp(around[:, :2], axis=0)) >= presets.OBJECT.length
+        assert np.ptp(around[:, 2]) == pytest.approx(paper.OBJECT.height)
+        assert np.linalg.norm(np.ptp(around[:, :2], axis=0)) >= paper.OBJECT.length
         assert shown["stage"].vertices[:, 2].max() == pytest.approx(scene[grasp.STAGE] - geometry.PLATE_THICKNESS)
         assert shown["module 0"].axis[0] == pytest.approx([0.0, 0.0, scene[grasp.STAGE]])
         jaws = np.linalg.norm(shown["ring 1"].axis[-1] - shown["ring 0"].axis[-1])
         free = float(env.unwrapped.task.gap(record)[0])
         between = bool(scene[grasp.HELD] + scene[grasp.ASTRIDE])
-        assert jaws == pytest.approx(max(free, presets.OBJECT.width * between), abs=1e-9)
+        assert jaws == pytest.approx(max(free, paper.OBJECT.width * between), abs=1e-9)
         assert shown["gripper coil"].temperature == record.temperature[0, 4]
         seen.add((bool(scene[grasp.HELD]), bool(scene[grasp.ASTRIDE])))
     assert {(True, False), (False, True), (False, False)} <= seen  # held, between the jaws, alone
@@ -231,7 +238,7 @@ def test_the_depth_of_a_picture_is_that_of_the_solved_arm(name, camera, drawing)
         kind = key.split()[0]
         if kind in seen:
             column, row, deep = pixels(part.axis, camera).T
-            radius = 0.5 * presets.BODY_DIAMETER if kind == "module" else presets.COIL_RADIUS + 0.5 * presets.FIBRE_DIAMETER
+            radius = 0.5 * paper.BODY_DIAMETER if kind == "module" else COIL.radius + 0.5 * COIL.fibre_diameter
             found = depth[np.rint(row).astype(int), np.rint(column).astype(int)]
             if kind == "module":
                 assert (found[1:-1] < deep[1:-1]).all()  # its surface is there, or something before it
@@ -262,7 +269,7 @@ def test_pictures_of_two_states_differ_where_they_should(name, drawing):
     for name in before:
         if name not in ("table", "column"):
             for points in (filled(before[name]), filled(after[name])):
-                fallen = points + (presets.SITE.table - points[:, 2:]) * render.SUN  # its shadow
+                fallen = points + (paper.TABLE - points[:, 2:]) * render.SUN  # its shadow
                 column, row, _ = np.rint(pixels(np.concatenate([points, fallen]))).astype(int).T
                 seen = (column >= 0) & (column < SIDE) & (row >= 0) & (row < SIDE)
                 expected[row[seen], column[seen]] = True
@@ -295,7 +302,7 @@ def test_a_hot_coil_has_the_colour_of_its_temperature(drawing):
 def test_the_arm_casts_a_shadow_on_the_table_before_a_white_wall(drawing):
     env = hot("TCATwistAlign-v0", render_mode="rgb_array")
     picture, shown = env.render().astype(float).mean(axis=2), parts(env)
-    fallen = shown["ring 1"].axis + (presets.SITE.table - shown["ring 1"].axis[:, 2:]) * render.SUN
+    fallen = shown["ring 1"].axis + (paper.TABLE - shown["ring 1"].axis[:, 2:]) * render.SUN
     column, row, _ = np.rint(pixels(fallen)).astype(int).T
     beside = picture[row, column + 25]
     assert np.all(picture[row, column] < beside - 25.0) and np.ptp(beside) < 15.0
@@ -369,7 +376,7 @@ def test_gymnasiums_lists_and_videos(tmp_path, drawing):
     env.close()
     (video,) = tmp_path.glob("videos/*.mp4")
     with VideoFileClip(str(video)) as clip:
-        assert (clip.fps, clip.size) == (render.FPS, [64, 64])
+        assert (clip.fps, clip.size) == (env.metadata["render_fps"], [64, 64])
         assert clip.duration == pytest.approx(1.2, abs=0.11)
 
 
@@ -557,7 +564,7 @@ def test_a_step_is_shown_once_for_a_tenth_of_a_second():
 
     env = hot("TCAReach-v0", steps=1)
     core = env.unwrapped.core
-    renderer = render.Renderer("human", 64, 64, tuple(np.array(point) for point in render.CAMERAS["front"]))
+    renderer = render.Renderer("human", 64, 64, "front")
     renderer._scene = window = Window()
     for _ in range(3):  # as who calls `render` after `step`, which has drawn already
         renderer.render(env.unwrapped.task, core)

@@ -2,12 +2,18 @@
 
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from tca_envs.mechanics import TCA, Arm, Module, Muscle, Payload, Spring, Tendon, section, shooting
+from agents.scripted import controller_of
+from study import shooting
+from study.method import lanes_at
+from tca_envs.mechanics import TCA, Arm, Module, Muscle, Payload, Rung, Spring, Tendon, continuation, section, thermal
+from tca_envs.mechanics.thermal import Heat, Heater
+from tca_envs.robots.paper import bending_arm
 
 E, G, LENGTH, RADIUS, DENSITY = 0.125e6, 0.125e6 / 3.0, 0.045, 0.0045, 1070.0
 AREA = np.pi * RADIUS**2
@@ -179,7 +185,7 @@ def test_total_force_is_the_load_beyond(both):
         tension = found.tensions[first : first + len(module.muscles)]
         for fraction in (0.999, 0.7, 0.3, 0.0):
             s = end - module.length * (1.0 - fraction)
-            route = np.array([module.route(muscle, fraction) for muscle in module.muscles]).reshape(-1, 4)
+            route = np.array([muscle.route(module.length, fraction) for muscle in module.muscles]).reshape(-1, 4)
             inside, _ = section.balance(
                 module.stiffness, module.reference_strain, route, tension, found.strain([s])[0], np.zeros(6)
             )
@@ -340,3 +346,82 @@ def test_bad_input(arguments, word):
     good = {"arm": Arm([rod(straight([Tendon()]))]), "drive": [0.1]}
     with pytest.raises(ValueError, match=word):
         shooting.equilibrium(**(good | arguments))
+
+
+# As a solver of environments
+
+
+def batch_of(arm, count):
+    """So many lanes at rest, as `continuation.solve` brings them to equilibrium."""
+    lanes = lanes_at(arm.unloaded(), count)
+    drive, load = lanes.drive.copy(), np.repeat(arm.load()[np.newaxis], count, axis=0)
+    assert (continuation.solve(arm, lanes, drive, load)["rung"] != Rung.FAILED).all()
+    return lanes, load
+
+
+def test_steps_an_environment_as_the_packages_solver_does():
+    """Two heated arms over ten steps, each solver from its own last state; then each goes on from the other's."""
+    arm = bending_arm(tolerance=1e-8)
+    heating = Heater().scaled(arm.rest_lengths)
+    constants = thermal.constants(0.1, 150.0, heating)
+    ours, load = batch_of(arm, 2)
+    paper = continuation.Lanes(*(values.copy() for values in ours))
+    rng = np.random.default_rng(0)
+    temperatures = [np.full((2, 3), 25.0), np.full((2, 3), 25.0)]
+    for step in range(12):
+        action = rng.uniform(-1.2, 1.2, (2, 3))
+        action[0, 0] = 1.0  # up to the limit
+        if step == 10:
+            ours, paper = paper, ours
+        tips = []
+        for side, (solver, lanes) in enumerate(((continuation.solve, ours), (shooting.solve, paper))):
+            heat = Heat(action, temperatures[side], np.full((2, 3), np.nan), constants)
+            drive = np.full((2, 3), np.nan)
+            report = solver(arm, lanes, drive, load, 1, heat)
+            assert (report["rung"] != Rung.FAILED).all() and not report["jumped"].any()
+            power = np.clip(0.5 * (np.clip(action, -1.0, 1.0) + 1.0) * heating.max_power, 0.0, None)
+            allowed = thermal.power_to_reach(temperatures[side], 150.0, 0.1, heating)
+            np.testing.assert_allclose(heat.power, np.minimum(power, np.maximum(allowed, 0.0)), atol=1e-12)
+            np.testing.assert_allclose(drive, thermal.step(temperatures[side], heat.power, 0.1, heating), atol=1e-9)
+            np.testing.assert_array_equal(lanes.drive, drive)
+            np.testing.assert_array_equal(lanes.load, load)
+            temperatures[side] = drive
+            tips.append(lanes.tip[:, :3, 3].copy())
+        assert (report["iterations"] > 0).all() and (report["residual"] <= 1e-5).all()
+        np.testing.assert_allclose(tips[1], tips[0], atol=1e-5)
+        np.testing.assert_allclose(paper.length, ours.length, atol=1e-6)
+        np.testing.assert_allclose(paper.strain, ours.strain, atol=5e-2)
+        np.testing.assert_allclose(paper.tension, ours.tension, atol=1e-4)
+    assert np.abs(tips[0][:, :2]).max() > 2e-3 and temperatures[0].max() > 100.0
+
+
+def test_a_lane_without_an_answer_stays_as_it_was(monkeypatch):
+    arm = bending_arm()
+    lanes, load = batch_of(arm, 2)
+    before = continuation.Lanes(*(values.copy() for values in lanes))
+    monkeypatch.setattr(shooting, "MAX_EVALUATIONS", 20)
+    drive = np.array([[30.0, 25.0, 25.0], [25.0, 25.0, 25.0]])
+    load[1, 0] = 50.0
+    report = shooting.solve(arm, lanes, drive, load)
+    assert report["rung"].tolist() == [Rung.WARM, Rung.FAILED] and not report["jumped"].any()
+    for values, kept in zip(lanes, before, strict=True):
+        np.testing.assert_array_equal(values[1], kept[1])
+        assert not np.array_equal(values[0], kept[0]) or values is lanes.load
+
+
+def test_an_episode_is_the_same_with_either_solver():
+    """A scripted episode of Reach; with shooting, every step takes about 0.4 s, and the whole of it some 40 s."""
+    envs = [gymnasium.make("TCAReach-v0"), gymnasium.make("TCAReach-v0", solver="shooting")]
+    observation, _ = (env.reset(seed=3)[0] for env in envs)
+    controller, successes, over = controller_of("reach"), 0, False
+    for _ in range(100):
+        assert not over
+        action, _ = controller.predict(observation)
+        (observation, *_, over, told), (*_, paper_over, paper_told) = (env.step(action) for env in envs)
+        tip, paper_tip = (env.unwrapped.core.record.tip[0, :3, 3] for env in envs)
+        assert np.linalg.norm(paper_tip - tip) < 1e-5
+        assert paper_told["is_success"] == told["is_success"] and paper_over == over
+        assert paper_told["solver"]["iterations"] > told["solver"]["iterations"]  # residuals, where Newton takes few steps
+        successes += told["is_success"]
+    assert over and 0 < successes < 100
+    assert np.linalg.norm(tip[:2]) > 1e-3

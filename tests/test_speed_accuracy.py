@@ -3,6 +3,7 @@
 import csv
 import time
 from dataclasses import replace
+from functools import partial
 from math import isnan, nan
 from typing import NamedTuple
 
@@ -10,12 +11,12 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from study import __main__ as command
+from study import chart, pattern, scenes, size, speed_accuracy, timing
+from study.method import Answer, Method
+from study.methods import METHODS, collocation
+from study.timing import Effort, Point, Referee
 from tca_envs.mechanics import Payload
-from tca_envs.study import __main__ as command
-from tca_envs.study import chart, output, scenes, size, speed_accuracy, timing
-from tca_envs.study.method import Answer, Method
-from tca_envs.study.methods import METHODS, collocation
-from tca_envs.study.timing import Effort, Point, Referee
 
 COUNT = 6
 """Cases of a scene."""
@@ -69,7 +70,7 @@ def test_one_degree_changes_every_tca_by_one_degree_between_the_limits():
 
 
 def test_recorded_states_change_temperature_and_payload_as_the_task_does():
-    cases = scenes.pick_and_place(30).cases
+    cases = scenes.SCENES["pick-and-place"](30).cases
     change = np.array([np.abs(case.state.drive - case.before.drive).max() for case in cases])
     assert ((change > scenes.LEAST_CHANGE) | [case.before.payload != case.state.payload for case in cases]).all()
     assert change.max() < 15.0
@@ -78,8 +79,8 @@ def test_recorded_states_change_temperature_and_payload_as_the_task_does():
 
 
 def test_evenly_keeps_the_ends():
-    assert scenes.evenly(list(range(10)), 4) == [0, 3, 6, 9]
-    assert scenes.evenly([1, 2], 5) == [1, 2]
+    assert pattern.evenly(list(range(10)), 4) == [0, 3, 6, 9]
+    assert pattern.evenly([1, 2], 5) == [1, 2]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 12, 13])
@@ -135,7 +136,7 @@ def bending():
 
 
 def measured(scene, method, effort=BRIEF):
-    (point,) = timing.points(scene, method, Referee(scene), effort, lambda: None)
+    (point,) = timing.points(scene, method, Referee(scene), effort)
     return point
 
 
@@ -206,7 +207,7 @@ def test_the_budget_ends_a_point_and_patience_a_method(bending):
         return answer
 
     method = replace(fake(slow), settings=(1, 2))
-    first, second = timing.points(bending, method, Referee(bending), Effort(4, 0.02, 2, 0.05), lambda: None)
+    first, second = timing.points(bending, method, Referee(bending), Effort(4, 0.02, 2, 0.05))
     assert first.cases == 2
     assert second.cases == 0 and second.note.startswith("not run")
 
@@ -222,11 +223,11 @@ def test_what_builds_slowly_is_left_out_when_there_is_no_time(bending):
     method = Method("fake", "knob", (1, 2, 3), build, builds_slowly=True)
     for building, settings in ((0.0, []), (0.03, [1, 2]), (np.inf, [1, 2, 3])):
         built.clear()
-        found = timing.points(bending, method, Referee(bending), BRIEF._replace(building=building), lambda: None)
+        found = timing.points(bending, method, Referee(bending), BRIEF._replace(building=building))
         assert built == settings and [p.solved for p in found] == [s in settings for s in (1, 2, 3)]
         assert all(p.note.startswith("not run") for p in found if not p.solved)
     quickly = replace(method, builds_slowly=False)
-    assert all(p.solved for p in timing.points(bending, quickly, Referee(bending), BRIEF._replace(building=0.0), lambda: None))
+    assert all(p.solved for p in timing.points(bending, quickly, Referee(bending), BRIEF._replace(building=0.0)))
 
 
 def test_the_error_against_the_finest_setting(bending):
@@ -234,7 +235,7 @@ def test_the_error_against_the_finest_setting(bending):
         return Fake(collocation.Collocation(arm), moved(setting))
 
     method = Method("fake", "shift", (3e-3, 2e-3), build, own_limit=True)
-    coarse, fine = timing.points(bending, method, Referee(bending), BRIEF, lambda: None)
+    coarse, fine = timing.points(bending, method, Referee(bending), BRIEF)
     assert coarse.error == pytest.approx(3e-3, rel=1e-3)
     assert coarse.own_error == pytest.approx(1e-3, rel=1e-9) and fine.own_error == 0.0
 
@@ -317,12 +318,12 @@ def test_cells_of_the_table_of_ratios():
     [(1.5, "1.5 s"), (0.0, "0 s"), (1e-3, "1 ms"), (2.346e-5, "23.5 µs"), (1e-13, "100 fs"), (1e-18, "0.001 fs"), (nan, "--")],
 )
 def test_numbers_with_prefixes(value, text):
-    assert speed_accuracy.si(value, "s") == text
+    assert pattern.si(value, "s") == text
 
 
 @pytest.mark.parametrize(("share", "text"), [(0.0, "0 %"), (0.001, "1 %"), (0.999, "99 %"), (1.0, "100 %"), (0.333, "33 %")])
 def test_percentages_are_none_or_all_only_if_they_are(share, text):
-    assert speed_accuracy.percent(share) == text
+    assert pattern.percent(share) == text
 
 
 # What is written.
@@ -338,7 +339,8 @@ def written(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(speed_accuracy, "QUICK", Effort(4, np.inf, 1, np.inf))
         ours = replace(METHODS[0], settings=METHODS[0].settings[:2])
-        speed_accuracy.run(folder, ["cold"], True, [ours, bad, some], said.append)
+        study = speed_accuracy.STUDY._replace(measure=partial(speed_accuracy.measure, methods=[ours, bad, some]))
+        pattern.run(study, folder, said.append, scenes=["cold"], quick=True)
     return folder, "\n".join(said)
 
 
@@ -349,7 +351,7 @@ def test_the_run_writes_every_point(written):
     }  # fmt: skip
     with (folder / "speed_accuracy.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert tuple(rows[0]) == speed_accuracy.HEADER
+    assert list(rows[0]) == [column.name for column in speed_accuracy.COLUMNS if column.name]
     coarse, fine = map(timing.label, METHODS[0].settings[:2])
     asked = [(METHODS[0].name, coarse), (METHODS[0].name, fine), ("bad", "0.5"), ("bad", "1"), ("some", "1")]
     assert [(row["method"], row["setting"], row["cases"]) for row in rows] == [(*pair, "4") for pair in asked]
@@ -397,7 +399,7 @@ def test_sizes_are_written_and_drawn(tmp_path, monkeypatch):
     for name in ("MODULES", "MUSCLES", "LANES"):
         monkeypatch.setattr(size, name, getattr(size, name)._replace(values=(1, 2, 3)))
     said = []
-    size.run(tmp_path, True, said.append)
+    pattern.run(size.STUDY, tmp_path, said.append, quick=True)
     assert {path.name for path in tmp_path.iterdir()} == {"size.png", "size.csv"}
     with (tmp_path / "size.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -411,7 +413,7 @@ def test_sizes_are_written_and_drawn(tmp_path, monkeypatch):
         whole, each = float(row["median_time_s"]), float(row["median_time_of_a_lane_s"])
         assert 0.0 < whole < 1.0 and each == pytest.approx(whole / int(row["lanes"]))
         assert float(row["iterations"]) > 0.0
-    assert len(said) == 4
+    assert said[0].count("time ~") == 3 and "size.png" in said[1]
 
 
 def test_the_fit_is_through_the_larger_half():
@@ -443,29 +445,24 @@ def test_bad_arguments_are_told(arguments, message, capsys, tmp_path, monkeypatc
 
 def test_options_reach_the_study(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(speed_accuracy, "run", lambda *arguments: asked.append(arguments))
-    monkeypatch.setattr(size, "run", lambda *arguments: asked.append(arguments))
+    monkeypatch.setattr(pattern, "run", lambda study, out, **options: asked.append((study.name, out, options)))
     assert command.main(["speed-accuracy", "--out", str(tmp_path), "--scene", "cold", "--scene", "long", "--quick"]) == 0
     assert command.main(["speed-accuracy", "--out", str(tmp_path)]) == 0
     assert command.main(["size", "--out", str(tmp_path), "--quick"]) == 0
-    assert asked == [(tmp_path, ["cold", "long"], True), (tmp_path, None, False), (tmp_path, True)]
+    assert asked == [
+        ("speed-accuracy", tmp_path, {"scenes": ["cold", "long"], "quick": True}),
+        ("speed-accuracy", tmp_path, {"scenes": None, "quick": False}),
+        ("size", tmp_path, {"quick": True}),
+    ]
 
 
 def test_missing_packages_are_told(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(output, "find_spec", lambda name: None if name == "tqdm" else name)
+    monkeypatch.setattr(pattern, "find_spec", lambda name: None if name == "tqdm" else name)
     with pytest.raises(SystemExit) as stop:
         command.main(["speed-accuracy", "--out", str(tmp_path / "out")])
     assert stop.value.code == 2
     assert "needs tqdm" in (error := capsys.readouterr().err) and "pip install 'tca_envs[train]'" in error
     assert not (tmp_path / "out").exists()
-
-
-def test_missing_controllers_are_told(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(scenes, "find_spec", lambda name: None)
-    with pytest.raises(SystemExit) as stop:
-        command.main(["speed-accuracy", "--out", str(tmp_path), "--scene", "reach"])
-    assert stop.value.code == 2
-    assert "scene reach runs the scripted controllers of `agents`, which are in a checkout" in capsys.readouterr().err
 
 
 def test_payloads_compare_by_value():

@@ -6,13 +6,13 @@ from math import nan
 import numpy as np
 import pytest
 
-from tca_envs.study import __main__ as command
-from tca_envs.study import stability, stability_cells
-from tca_envs.study.method import Answer, State
-from tca_envs.study.methods import bvp, paper, wrench_shooting
-from tca_envs.study.scenes import Case
-from tca_envs.study.stability import Result
-from tca_envs.study.stability_judge import WORDS, Outcome, outcome
+from study import __main__ as command
+from study import pattern, stability, stability_cells
+from study.method import Answer, State
+from study.methods import bvp, paper, wrench_shooting
+from study.scenes import Case
+from study.stability import Result
+from study.stability_judge import WORDS, Outcome, outcome
 
 OURS, WRENCH = stability.OURS.name, wrench_shooting.METHOD.name
 
@@ -122,12 +122,14 @@ def test_the_verdict_follows_from_the_cells():
 
 
 def test_the_study_writes_maps_chart_table_and_page(tmp_path, monkeypatch):
-    family = stability_cells.tension_force(2)
+    family = stability_cells.FAMILIES["tension-force"](2)
     monkeypatch.setattr(stability, "FAMILIES", {family.name: lambda count: family})
     monkeypatch.setattr(stability, "COMPARED", (stability.COMPARED[0], (wrench_shooting.METHOD, 16)))
-    monkeypatch.setattr(stability.torture, "run", lambda out, quick: f"## Policies\n\n{quick}\n")
+    monkeypatch.setattr(stability.torture, "measure", lambda quick: [quick])
+    monkeypatch.setattr(stability.torture, "report", lambda runs: f"## Policies\n\n{runs}\n")
     said = []
-    stability.run(tmp_path, quick=True, say=said.append)
+    tables = {"stability.csv": stability.STUDY.tables["stability.csv"]}
+    pattern.run(stability.STUDY._replace(tables=tables), tmp_path, said.append, quick=True)
     with (tmp_path / "stability.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 8 and {r["method"] for r in rows} == {OURS, WRENCH}
@@ -138,7 +140,7 @@ def test_the_study_writes_maps_chart_table_and_page(tmp_path, monkeypatch):
     assert (tmp_path / "stability_map.png").stat().st_size > 10_000 < (tmp_path / "failure_rate.png").stat().st_size
     page = (tmp_path / "stability.md").read_text(encoding="utf-8")
     assert "4 cells, 4 with a right answer" in page and "On every one of" in page and f"| {OURS} " in page
-    assert said[0] in page and page.endswith("\n\n## Policies\n\nTrue\n")
+    assert said[0] in page and page.endswith("\n\n## Policies\n\n[True]\n")
 
 
 def test_a_step_starts_from_the_methods_own_answer():
@@ -147,7 +149,7 @@ def test_a_step_starts_from_the_methods_own_answer():
     cell = stability_cells.Cell(0.0, 0.0, Case(before, state))
     family = stability_cells.Family("step", "", "", "", (cell,))
     methods = (stability.COMPARED[0], (wrench_shooting.METHOD, 32))
-    mine, other = stability.measure(family, methods, stability_cells.Referee(), lambda: None)
+    mine, other = stability.measure(family, methods, stability_cells.Referee())
     assert mine.right and mine.note == "WARM" and other.right and other.note == ""
 
 

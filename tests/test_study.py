@@ -4,19 +4,23 @@ import csv
 import io
 import subprocess
 import sys
+import tomllib
 from contextlib import redirect_stdout
 from dataclasses import replace
+from fnmatch import fnmatch
 from math import isnan, nan
+from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import matplotlib.image
 import numpy as np
 import pytest
 
-from tca_envs import presets
+from study import __main__ as command
+from study import paper, pattern, sequence
 from tca_envs.mechanics import TCA, Arm, grasp
-from tca_envs.study import __main__ as command
-from tca_envs.study import output, paper, sequence
+from tca_envs.robots import paper as robot
 
 COARSE = np.linspace(25.0, 160.0, 28)
 """[degC]"""
@@ -43,7 +47,7 @@ def columns(rows, first):
 
 @pytest.mark.parametrize("case", [paper.HARDWARE, paper.PAPER])
 def test_passive_elongation_meets_the_published_points(case):
-    comparisons = paper.compare3(paper.figure3(case))
+    comparisons = paper.compare(paper.figure3(case))
     assert len(comparisons) == 5
     assert all(abs(c.difference) < 0.3 and c.agrees for c in comparisons)
 
@@ -104,8 +108,8 @@ def test_heating_all_three_lifts_the_tip_straight_up():
 
 def test_the_weight_of_equation_9_brings_the_papers_set_to_figure_4():
     """Density times effective section: within 1 mm everywhere, while the estimated weight misses by up to 7.5 mm."""
-    light = paper.compare4(paper.figure4(paper.PAPER_EFFECTIVE))
-    heavy = paper.compare4(paper.figure4(paper.PAPER))
+    light = paper.compare(paper.figure4(paper.PAPER_EFFECTIVE))
+    heavy = paper.compare(paper.figure4(paper.PAPER))
     assert max(abs(c.difference) for c in light) < 1.0
     assert sum(c.agrees for c in light) == 10
     assert not any(c.agrees for c in heavy)
@@ -363,7 +367,7 @@ def test_a_file_in_place_of_the_folder_is_told(below, tmp_path, capsys):
 
 
 def test_missing_matplotlib_is_told_before_any_work(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(output, "find_spec", lambda name: None)
+    monkeypatch.setattr(pattern, "find_spec", lambda name: None)
     with pytest.raises(SystemExit) as stop:
         command.main(["paper", "--out", str(tmp_path / "out")])
     assert stop.value.code == 2
@@ -373,8 +377,8 @@ def test_missing_matplotlib_is_told_before_any_work(tmp_path, monkeypatch, capsy
 
 def test_the_studies_load_without_matplotlib_and_pyplot_stays_untouched():
     code = (
-        "import sys; from tca_envs.study import __main__ as m, output; assert 'matplotlib' not in sys.modules;"
-        "output.new_figure(1, 2, 2); assert 'matplotlib.pyplot' not in sys.modules"
+        "import sys; from study import __main__ as m, pattern; assert 'matplotlib' not in sys.modules;"
+        "pattern.new_figure(1, 2, 2); assert 'matplotlib.pyplot' not in sys.modules"
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
@@ -391,28 +395,28 @@ def frames():
 def test_figure_6_picks_up_and_puts_down(frames):
     assert [frame.label for frame in frames] == ["start", "twist", "open", "lower, close", "lift", "untwist", "bend, open"]
     start, twist, opened, closed, lifted, untwisted, placed = frames
-    height = presets.OBJECT.height
+    height = robot.OBJECT.height
     assert twist.yaw == pytest.approx(sequence.OBJECT_YAW, abs=1.0)
-    assert start.gap == pytest.approx(0.0, abs=1e-9) and opened.gap > presets.OBJECT.width
+    assert start.gap == pytest.approx(0.0, abs=1e-9) and opened.gap > robot.OBJECT.width
     assert [frame.scene[grasp.HELD] for frame in frames] == [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0]
     for frame in (start, twist, opened, closed, placed):
-        assert frame.scene[grasp.Z] == pytest.approx(presets.SITE.table - 0.5 * height, abs=1e-6)
+        assert frame.scene[grasp.Z] == pytest.approx(robot.TABLE - 0.5 * height, abs=1e-6)
     assert closed.scene[grasp.Z] - lifted.scene[grasp.Z] == pytest.approx(closed.scene[grasp.STAGE], abs=1e-5)
     assert closed.scene[grasp.STAGE] == pytest.approx(sequence.LOWERED, rel=0.1)
     assert untwisted.yaw == pytest.approx(0.0, abs=1.0)
     # The object turns with the gripper.
     turned = np.degrees(untwisted.scene[grasp.YAW] - lifted.scene[grasp.YAW])
     assert turned == pytest.approx(untwisted.yaw - lifted.yaw, abs=1e-6)
-    assert 2.0 * presets.OBJECT.friction * lifted.pinch > presets.OBJECT.mass * 9.81
+    assert 2.0 * robot.OBJECT.friction * lifted.pinch > robot.OBJECT.mass * 9.81
     assert placed.scene[grasp.X] > 5e-3 and abs(placed.scene[grasp.Y]) < 1e-3
 
 
 def test_figure_6_fails_with_the_papers_set_because_the_gripper_opens_too_little():
     frames = sequence.figure6(TCA.paper())
-    assert max(frame.gap for frame in frames) < presets.OBJECT.width
+    assert max(frame.gap for frame in frames) < robot.OBJECT.width
     assert not any(frame.scene[grasp.HELD] for frame in frames)
     # The stage stops where the jaws stand on the object.
-    top = presets.SITE.table - presets.OBJECT.height
+    top = robot.TABLE - robot.OBJECT.height
     assert sequence.place(frames[3].arm)[0][2] + frames[3].scene[grasp.STAGE] == pytest.approx(top, abs=1e-9)
     assert (frames[-1].scene[grasp.X : grasp.YAW + 1] == frames[0].scene[grasp.X : grasp.YAW + 1]).all()
 
@@ -440,7 +444,57 @@ def test_the_table_says_that_figure_6_works_with_the_hardware_set_only(written):
 
 @pytest.mark.parametrize("gap", [0.0, 3e-3, 7e-3])
 def test_the_drawn_ring_has_its_length_and_gap(gap):
-    ring = presets.gripper()
+    ring = robot.ring()
     left, right = (sequence.ring(ring, gap, side, 400) for side in (-1.0, 1.0))
     assert np.linalg.norm(np.diff(left, axis=0), axis=1).sum() == pytest.approx(0.5 * ring.length, rel=1e-4)
     assert right[-1, 0] - left[-1, 0] == pytest.approx(gap, abs=1e-9)
+
+
+# The pattern of the studies.
+
+
+def test_studies_are_not_installed():
+    settings = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
+    assert not any(fnmatch("study", name) for name in settings["setuptools"]["packages"]["find"]["include"])
+    assert "study" in settings["mypy"]["files"]
+
+
+def test_a_study_writes_its_columns_figures_and_page(tmp_path):
+    """Rows with a name are in the file, those with a heading in the table; numbers with nine digits, missing ones as nan."""
+
+    class Row(NamedTuple):
+        name: str
+        length: float
+
+    columns = [
+        pattern.Column("name", "name", "Name"), pattern.Column("length", "length_m", "Length", pattern.in_metres),
+        pattern.Column(lambda row: 2.0 * row.length, "twice_m"), pattern.Column("length", "", "Share", pattern.percent),
+    ]  # fmt: skip
+    asked, said = [], []
+    study = pattern.Study(
+        "toy",
+        "a toy",
+        lambda quick: asked.append(quick) or [Row("a", 1.0 / 3.0), Row("b", nan)],
+        tables={"toy.csv": (columns, lambda found: found)},
+        figures=lambda found: iter([("toy.png", pattern.new_figure(1, 2.0, 2.0)[0])]),
+        page=("toy.md", lambda found: pattern.page("# Toy", "", pattern.table(columns, found))),
+        findings=lambda found: f"{len(found)} rows",
+    )
+    pattern.run(study, tmp_path, said.append, quick=True)
+    assert asked == [True] and said == ["2 rows", f"wrote toy.csv, toy.png, toy.md in {tmp_path}"]
+    assert (tmp_path / "toy.csv").read_text() == "name,length_m,twice_m\na,0.333333333,0.666666667\nb,nan,nan\n"
+    page = (tmp_path / "toy.md").read_text(encoding="utf-8")
+    rule, first, second = page.removeprefix("# Toy\n\n| Name | Length | Share |\n").splitlines()
+    assert (rule, first) == ("|------|--------|-------|", "| a    | 333 mm | 33 %  |")
+    assert second.split() == ["|", "b", "|", "--", "|", "--", "|"]
+    assert (tmp_path / "toy.png").stat().st_size > 1_000
+
+
+def test_every_study_states_what_it_writes():
+    assert [study.name for study in command.STUDIES] == [
+        "paper", "speed-accuracy", "tolerance", "stability", "size", "throughput", "effects",
+    ]  # fmt: skip
+    for study in command.STUDIES:
+        for columns, _ in study.tables.values():
+            names = [column.name for column in columns if column.name]
+            assert len(set(names)) == len(names)

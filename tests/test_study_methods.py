@@ -5,11 +5,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tca_envs import presets
-from tca_envs.mechanics import TCA, Arm, Grid, Module, Muscle, Payload, Spring, Tendon, shooting
-from tca_envs.study import effects
-from tca_envs.study.method import State
-from tca_envs.study.methods import METHODS, ablation, bvp, paper, strain_basis
+from study import effects, shooting
+from study.method import State
+from study.methods import METHODS, ablation, bvp, paper, strain_basis
+from tca_envs.mechanics import TCA, Arm, Grid, Module, Muscle, Payload, Spring, Tendon
+from tca_envs.robots import paper as robot
 
 CURVATURE, PIECES, POLYNOMIALS, KIRCHHOFF = strain_basis.METHODS
 FULL = (PIECES, POLYNOMIALS, bvp.METHOD, *paper.METHODS)
@@ -99,7 +99,7 @@ def test_gravity_and_payload_bend_a_rod_that_lies(method):
 
 @compiled
 def test_error_of_constant_pieces_falls_with_their_number_squared():
-    errors = [warm(PIECES, pieces, presets.bending_arm, BENT) for pieces in PIECES.settings[1:]]
+    errors = [warm(PIECES, pieces, robot.bending_arm, BENT) for pieces in PIECES.settings[1:]]
     ratios = np.divide(errors[:-1], errors[1:])
     assert ((ratios > 3.5) & (ratios < 4.5)).all()
     assert errors[-1] < 1.2e-5
@@ -107,14 +107,14 @@ def test_error_of_constant_pieces_falls_with_their_number_squared():
 
 @compiled
 def test_polynomials_converge_exponentially():
-    errors = [warm(POLYNOMIALS, order, presets.bending_arm, BENT) for order in POLYNOMIALS.settings]
+    errors = [warm(POLYNOMIALS, order, robot.bending_arm, BENT) for order in POLYNOMIALS.settings]
     assert errors[0] > 1e-3 and errors[3] < 2e-6 and errors[4] < 5e-8
 
 
 @compiled
 def test_polynomials_bend_out_of_plane():
     """Curvature that turns: rotations do not commute along the module."""
-    arm, drive, force = fine(presets.bending_arm), np.array([150.0, 60.0, 25.0]), (0.0, 0.02, 0.0)
+    arm, drive, force = fine(robot.bending_arm), np.array([150.0, 60.0, 25.0]), (0.0, 0.02, 0.0)
     known = arm.equilibrium(drive, force)
     state = State(arm, drive, force)
     basis = strain_basis.reduce(arm, strain_basis.ALL, 1, 6)
@@ -130,24 +130,24 @@ def test_polynomials_bend_out_of_plane():
     ],
 )
 def test_both_modules(method, setting, limit):
-    assert warm(method, setting, presets.whole_arm, WHOLE, tip_force=(0.0, 1e-3, 0.0)) < limit
+    assert warm(method, setting, robot.whole_arm, WHOLE, tip_force=(0.0, 1e-3, 0.0)) < limit
 
 
 def test_boundary_value_problem_meets_its_tolerance():
-    errors = [warm(bvp.METHOD, tolerance, presets.bending_arm, BENT) for tolerance in bvp.METHOD.settings[:4]]
+    errors = [warm(bvp.METHOD, tolerance, robot.bending_arm, BENT) for tolerance in bvp.METHOD.settings[:4]]
     assert errors[0] < 1e-5 and errors[2] < 1e-7 and errors[3] < 5e-9
 
 
 @pytest.mark.parametrize("method", some(*paper.METHODS), ids=name)
 def test_shooting_goes_on_from_its_last_answer(method):
-    assert warm(method, 1e-2, presets.bending_arm, BENT) < 5e-4
-    assert warm(method, 1e-4, presets.bending_arm, BENT) < 2e-6
+    assert warm(method, 1e-2, robot.bending_arm, BENT) < 5e-4
+    assert warm(method, 1e-4, robot.bending_arm, BENT) < 2e-6
 
 
 @compiled
 def test_shooting_takes_a_good_start():
     """Where the straight arm is none: the plain method spends its evaluations there."""
-    arm = fine(presets.bending_arm)
+    arm = fine(robot.bending_arm)
     state = State(arm, BENT)
     solver = paper.started(arm, 1e-3, [state])
     answer = solver.solve(state, solver.cold())
@@ -157,7 +157,7 @@ def test_shooting_takes_a_good_start():
 
 @compiled
 def test_kirchhoff_rods_neither_shear_nor_stretch():
-    arm = fine(presets.bending_arm)
+    arm = fine(robot.bending_arm)
     stiff = effects.without_extension(effects.without_shear(arm))
     state = State(arm, BENT, (0.0, 5e-3, 0.0))
     solver = KIRCHHOFF.build(arm, 4, [state])
@@ -168,7 +168,7 @@ def test_kirchhoff_rods_neither_shear_nor_stretch():
 
 @compiled
 def test_constant_curvature_does_not_twist():
-    arm = fine(presets.whole_arm)
+    arm = fine(robot.whole_arm)
     state = State(arm, np.array([25.0, 25.0, 25.0, 120.0]))
     solver = CURVATURE.build(arm, 1, [state])
     answer = solver.solve(state, solver.cold())
@@ -179,7 +179,7 @@ def test_constant_curvature_does_not_twist():
 
 @pytest.mark.parametrize("method", some(*(method for method in METHODS[1:] if method.available())), ids=name)
 def test_a_known_equilibrium_is_a_start(method):
-    arm = fine(presets.bending_arm)
+    arm = fine(robot.bending_arm)
     known = arm.equilibrium(BENT)
     state = State(arm, BENT)
     solver = method.build(arm, method.settings[2 % len(method.settings)], [state])
@@ -189,7 +189,7 @@ def test_a_known_equilibrium_is_a_start(method):
 
 @compiled
 def test_starts_are_near_the_answer():
-    arm = fine(presets.whole_arm)
+    arm = fine(robot.whole_arm)
     known = arm.equilibrium(WHOLE)
     state = State(arm, WHOLE)
     basis = PIECES.build(arm, 16, [state])
@@ -197,8 +197,8 @@ def test_starts_are_near_the_answer():
     off, scale = np.abs(start.q - found.q).max(axis=0), np.abs(found.q).max(axis=0)
     assert (off < 0.1 * scale).all()
     np.testing.assert_allclose(start.tension, found.tension, atol=1e-3)
-    basis = POLYNOMIALS.build(fine(presets.bending_arm), 4, [])
-    known_bent = fine(presets.bending_arm).equilibrium(BENT)
+    basis = POLYNOMIALS.build(fine(robot.bending_arm), 4, [])
+    known_bent = fine(robot.bending_arm).equilibrium(BENT)
     start = basis.near(known_bent, state)
     found = basis.solve(State(basis.arm, BENT), start).guess
     np.testing.assert_allclose(start.q, found.q, atol=1e-3 * np.abs(found.q).max())
@@ -214,38 +214,39 @@ def test_starts_are_near_the_answer():
 @compiled
 @pytest.mark.parametrize(("pieces", "order"), [(1, 4), (8, 0), (3, 2)])
 def test_newton_has_the_tangent_of_the_reduced_equations(pieces, order):
-    arm = presets.whole_arm()
+    arm = robot.whole_arm()
     basis = strain_basis.reduce(arm, strain_basis.ALL, pieces, order)
     start = basis.solve(State(arm, WHOLE), basis.cold()).guess
     asked = State(arm, WHOLE + 3.0)
     rung, iterations = strain_basis.solve(
-        basis.model, start.q, start.tension, start.drive, start.load, asked.drive, asked.load, np.eye(4)
+        basis.plain, basis.model, start.q, start.tension, start.drive, start.load, asked.drive, asked.load, np.eye(4)
     )
     assert rung == strain_basis.WARM and iterations <= 4
 
 
 def test_boundary_value_problem_has_its_derivatives():
-    arm = presets.whole_arm()
+    arm = robot.whole_arm()
     known = arm.equilibrium(WHOLE)
     solver = bvp.build(arm, 1e-3, [])
     x, y, tension, _, _ = solver.near(known, State(arm, WHOLE))
-    problem = bvp.Problem(solver.model, WHOLE, arm.load((0.0, 0.01, 0.0), (1e-4, 0.0, 0.0)))
+    problem = bvp.Problem(solver, WHOLE, arm.load((0.0, 0.01, 0.0), (1e-4, 0.0, 0.0)))
     y = y + 0.01 * np.random.default_rng(0).normal(size=y.shape)
     by_state, by_tension = problem.fun_jac(x, y, tension)
-    by_start, by_end, by_pull = (block.copy() for block in problem.bc_jac(y[:, 0], y[:, -1], tension))
+    by_start, by_end, by_pull = (block.copy() for block in problem.boundary(y[:, 0], y[:, -1], tension)[1:])
     for i in range(len(y)):
         step = np.zeros_like(y)
         step[i] = 1e-6
-        found = (problem.fun(x, y + step, tension) - problem.fun(x, y - step, tension)) / 2e-6
+        found = (problem.rates(x, y + step, tension)[0] - problem.rates(x, y - step, tension)[0]) / 2e-6
         np.testing.assert_allclose(found, by_state[:, i], atol=1e-6)
         e = step[:, 0]
         for block, ends in ((by_start, ((e, 0), (-e, 0))), (by_end, ((0, e), (0, -e)))):
-            up, down = (problem.bc(y[:, 0] + a, y[:, -1] + b, tension) for a, b in ends)
+            up, down = (problem.boundary(y[:, 0] + a, y[:, -1] + b, tension)[0] for a, b in ends)
             np.testing.assert_allclose((up - down) / 2e-6, block[:, i], atol=1e-6)
     for i, e in enumerate(1e-6 * np.eye(len(tension))):
-        found = (problem.fun(x, y, tension + e) - problem.fun(x, y, tension - e)) / 2e-6
+        found = (problem.rates(x, y, tension + e)[0] - problem.rates(x, y, tension - e)[0]) / 2e-6
         np.testing.assert_allclose(found, by_tension[:, i], atol=1e-6)
-        found = (problem.bc(y[:, 0], y[:, -1], tension + e) - problem.bc(y[:, 0], y[:, -1], tension - e)) / 2e-6
+        up, down = (problem.boundary(y[:, 0], y[:, -1], tension + sign * e)[0] for sign in (1.0, -1.0))
+        found = (up - down) / 2e-6
         np.testing.assert_allclose(found, by_pull[:, i], atol=1e-6)
 
 
@@ -256,7 +257,7 @@ def test_boundary_value_problem_has_its_derivatives():
 )
 def test_hard_cold_starts_end_without_an_error(method, drive, tip_force, monkeypatch):
     monkeypatch.setattr(shooting, "MAX_EVALUATIONS", 20)  # seconds otherwise
-    arm = presets.bending_arm()
+    arm = robot.bending_arm()
     state = State(arm, np.array(drive), tip_force)
     for setting in {method.settings[0], method.settings[-1] if method.knob != "rtol" else 1e-2}:
         solver = method.build(arm, setting, [state])
@@ -267,7 +268,7 @@ def test_hard_cold_starts_end_without_an_error(method, drive, tip_force, monkeyp
 
 def test_boundary_value_problem_goes_in_substeps():
     """Straight to this state SciPy's Newton fails."""
-    arm = presets.bending_arm()
+    arm = robot.bending_arm()
     state = State(arm, np.array([117.0, 92.0, 35.0]), (-0.07, 0.09, 0.0))
     solver = bvp.build(arm, 1e-2, [state])
     assert error(solver.solve(state, solver.cold()), arm.equilibrium(state.drive, state.tip_force)) < 5e-5
@@ -284,7 +285,7 @@ def test_active_muscles_pull_by_themselves():
 
 
 def test_passive_muscles_are_taken_out():
-    arm = presets.bending_arm()
+    arm = robot.bending_arm()
     kept = effects.active(arm, np.array([25.0, 90.0, 25.0]))
     other = effects.with_muscles(arm, kept)
     assert kept.tolist() == [False, True, False] and other.muscles == (arm.muscles[1],)
@@ -303,7 +304,7 @@ def test_passive_muscles_are_taken_out():
 
 
 def test_gravity_off():
-    arm = presets.bending_arm()
+    arm = robot.bending_arm()
     state = State(arm, BENT, payload=Payload(0.01))
     solver = ablation.weightless(arm, "default", [state])
     reference = Arm(arm.modules).equilibrium(BENT)
@@ -312,7 +313,7 @@ def test_gravity_off():
 
 
 def test_stiffened_rods():
-    arm = presets.bending_arm()
+    arm = robot.bending_arm()
     s = np.linspace(0.0, 0.04, 5)
     sheared, stretched = (
         change(arm).equilibrium(BENT, (0.0, 0.01, 0.0)).strain(s)

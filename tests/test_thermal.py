@@ -4,11 +4,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from tca_envs import registry
 from tca_envs.mechanics import thermal
-from tca_envs.mechanics.muscle import REFERENCE_LENGTH
+from tca_envs.mechanics.laws import REFERENCE_LENGTH
 from tca_envs.mechanics.thermal import Heater
-from tca_envs.tasks import TASKS
-from tca_envs.tasks.core import CUT_OFF, STEP_S
+from tca_envs.robots import CUT_OFF
+from tca_envs.tasks.core import STEP_S
 
 HEATING = Heater().scaled([0.045, 0.045, 0.1111])
 
@@ -108,7 +109,7 @@ def test_bad_rest_lengths_are_refused(lengths):
 
 def test_environments_heat_by_the_closed_form_up_to_the_cut_off():
     """What is compiled into the loop over lanes against the functions of `thermal`, from cold to the cut-off."""
-    lanes = TASKS["pick-and-place"]("train", 1e-5).core(6)
+    lanes = registry.entry("pick-and-place").new().core(6)
     rng, cut = np.random.default_rng(0), 0
     for _ in range(40):
         action = np.clip(rng.uniform(-1.5, 9.0, (6, 5)), -1.5, 1.5)

@@ -8,9 +8,9 @@ import numba
 import numpy as np
 import pytest
 
-from tca_envs.study import __main__ as command
-from tca_envs.study import throughput
-from tca_envs.study.throughput import Effort, Rate, Start
+from study import __main__ as command
+from study import throughput
+from study.throughput import Effort, Rate, Start
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +18,8 @@ def found():
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(throughput.MOST, "async", 1)
         patch.setitem(throughput.MOST, "sync", 3)
-        yield throughput.rates("reach", Effort((1, 3, 5), 2, 60.0, 4))
+        effort = Effort((1, 3, 5), 2, 60.0, 4)
+        yield [rate for lanes in effort.lanes for rate in throughput.rates("reach", lanes, effort)]
 
 
 def test_every_kind_is_measured_up_to_its_largest_batch(found):
@@ -35,14 +36,14 @@ def test_a_window_is_a_reset_and_an_episode():
     done, reset, step = [], env.reset, env.step
     env.reset = lambda: done.append("reset") or reset()
     env.step = lambda action: done.append(step(action)[3].all())
-    assert throughput.episode_time(env, np.zeros((3, 2, 3)), 4) > 0.0
+    throughput.play(env, np.zeros((3, 2, 3)), 4)
     assert done == ["reset", False, False, False, True]
 
 
 def test_no_window_is_begun_without_patience():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(throughput, "batches", lambda *sizes: {("single", 1): lambda: gym.make("TCAReach-v0")})
-        (only,) = throughput.rates("reach", Effort((1,), 9, 0.0, 2))
+        (only,) = throughput.rates("reach", 1, Effort((1,), 9, 0.0, 2))
     assert len(only.seconds) == 1
 
 
@@ -80,9 +81,9 @@ def test_a_cold_start_comes_before_the_warm_one(monkeypatch):
 
 
 def test_the_command_writes_table_figure_and_page(monkeypatch, tmp_path, capsys):
-    def rates(task, effort, done):
+    def rates(task, lanes, effort):
         kinds = (("native", 1), ("native", 2), ("sync", 1), ("single", 1))
-        return [Rate(task, *kind, lanes, (0.5, 0.1, 0.2), 100 * lanes) for lanes in effort.lanes for kind in kinds]
+        return [Rate(task, *kind, lanes, (0.5, 0.1, 0.2), 100 * lanes) for kind in kinds]
 
     monkeypatch.setattr(throughput, "rates", rates)
     monkeypatch.setattr(throughput, "memory", lambda task: 12_345.0)

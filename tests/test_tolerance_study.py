@@ -5,10 +5,11 @@ import csv
 import numpy as np
 import pytest
 
-from tca_envs import presets
+from study import __main__ as command
+from study import pattern, tolerance
+from study.method import State
 from tca_envs.mechanics import Arm, Grid
-from tca_envs.study import __main__ as command
-from tca_envs.study import tolerance
+from tca_envs.robots import paper
 
 
 @pytest.fixture(scope="module")
@@ -27,17 +28,17 @@ def test_a_task_is_measured_at_every_tolerance(kept):
 
 
 def test_every_second_state_holds_the_object():
-    cases = tolerance.random_cases(presets.whole_arm(), True, 6)
-    assert [case.payload is not None for case in cases] == [False, True] * 3
-    assert all(case.payload is None for case in tolerance.random_cases(presets.whole_arm(), False, 6))
-    assert all(np.abs(case.drive - case.before).max() <= tolerance.CHANGE for case in cases)
+    cases = tolerance.random_cases(paper.whole_arm(), True, 6)
+    assert [case.state.payload is not None for case in cases] == [False, True] * 3
+    assert all(case.state.payload is None for case in tolerance.random_cases(paper.whole_arm(), False, 6))
+    assert all(np.abs(case.state.drive - case.before.drive).max() <= tolerance.CHANGE for case in cases)
 
 
 def test_a_wrong_arm_is_found_out():
     """The truth does not come from the arms that are judged: a coarse grid's error shows, a failure counts as outside."""
-    arm = presets.bending_arm()
+    arm = paper.bending_arm()
     coarse = Arm(arm.modules, arm.gravity, arm.payload, [Grid(1, 3)], 1e-9)
-    case = tolerance.Case(np.array([100.0, 30.0, 30.0]), np.array([105.0, 30.0, 30.0]), None)
+    case = tolerance.Case(*(State(arm, np.array([hot, 30.0, 30.0])) for hot in (100.0, 105.0)))
     fine = tolerance.finer(arm)
     near, far = tolerance.true_errors([arm, coarse], fine, case)
     assert near < 1e-5 < far < 1e-3
@@ -53,14 +54,13 @@ def fails(*arguments):
 
 
 def test_the_study_writes_table_figure_and_page(kept, tmp_path):
-    tolerance.write(kept, tmp_path / "tolerance.csv")
+    pattern.run(tolerance.STUDY._replace(measure=lambda: kept), tmp_path, lambda words: None)
     with (tmp_path / "tolerance.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [float(row["tolerance_m"]) for row in rows] == list(tolerance.TOLERANCES)
-    assert rows[0]["grids"] == tolerance.written(kept[0].arm) and float(rows[0]["share_within"]) == 1.0
-    tolerance.draw(kept, tmp_path / "tolerance.png")
+    assert rows[0]["grids"] == kept[0].grids and float(rows[0]["share_within"]) == 1.0
     assert (tmp_path / "tolerance.png").stat().st_size > 10_000
-    page = tolerance.report(kept)
+    page = (tmp_path / "tolerance.md").read_text(encoding="utf-8")
     assert page.count("| pick-and-place |") == len(kept) and "at least 100.00 %" in page
 
 

@@ -6,12 +6,15 @@ import time
 import numpy as np
 import pytest
 
-from tca_envs.mechanics import Rung, ladder, thermal
-from tca_envs.study import torture
-from tca_envs.tasks import TASKS, core
+from study import pattern, torture
+from tca_envs import registry
+from tca_envs.mechanics import Rung, continuation, thermal
+from tca_envs.robots import CUT_OFF
+from tca_envs.tasks import core
 from tca_envs.tasks.reach import Reach
 
-SOLVE = ladder.solve
+SOLVE = continuation.solve
+TASKS = [entry.name for entry in registry.entries()]
 
 
 class Heated(core.Core):
@@ -22,16 +25,16 @@ class Heated(core.Core):
 
     def _solve(self, record, temperature, external, heat=None):
         asked = 0.5 * (heat.action + 1.0) * self.heating.max_power
-        allowed = thermal.power_to_reach(record.temperature, core.CUT_OFF, core.STEP_S, self.heating)
+        allowed = thermal.power_to_reach(record.temperature, CUT_OFF, core.STEP_S, self.heating)
         power = np.clip(allowed, 0.0, asked)
         record.temperature[:] = thermal.step(record.temperature, power, core.STEP_S, self.heating)
-        return np.zeros((len(temperature), 4))
+        return np.zeros(len(temperature), dtype=continuation.REPORT)
 
 
 @pytest.fixture(scope="module")
 def histories():
     """Temperatures of TCATwistAlign's TCAs (steps, lanes, 4) under each policy, in episodes of 100 steps."""
-    task, result = TASKS["twist-align"]("train", 1e-5), {}
+    task, result = registry.entry("twist-align").new(), {}
     for name, policy in torture.POLICIES.items():
         heated, steps = Heated(task), []
         act = policy(np.random.default_rng(1), torture.LANES, task.actions, 4)
@@ -49,7 +52,7 @@ def histories():
 @pytest.fixture
 def no_goals(monkeypatch):
     """Episodes without a goal: none has to be solved for."""
-    monkeypatch.setattr(Reach, "draw", lambda task, core, rngs: (np.zeros((len(rngs), 3)), np.empty((len(rngs), 0))))
+    monkeypatch.setattr(Reach, "sample", lambda task, core, rngs: (np.zeros((len(rngs), 3)), np.empty((len(rngs), 0))))
 
 
 def changes(history):
@@ -77,7 +80,7 @@ def test_the_adversary_sets_hot_against_cold(histories):
 def test_the_adversary_takes_the_largest_steps_first(monkeypatch):
     monkeypatch.setattr(torture, "GREEDY", 0.0)
     act = torture.adversary(np.random.default_rng(0), torture.LANES, 4, 4)
-    heated = (act(Heated(TASKS["twist-align"]("train", 1e-5)), np.zeros(torture.LANES, dtype=int)) > 0.0).sum(axis=1)
+    heated = (act(Heated(registry.entry("twist-align").new()), np.zeros(torture.LANES, dtype=int)) > 0.0).sum(axis=1)
     assert heated.tolist() == [4, 3, 3, 3, 3, 2, 2, 2, 2, 2]
 
 
@@ -106,23 +109,23 @@ def test_nothing_fails(task, policy):
 def test_a_broken_solver_is_found_out(monkeypatch, no_goals):
     """One that gives up above 60 degC: each failure is counted, told with its temperatures, and ends the episode."""
 
-    def gives_up(*arguments):
-        state = (*arguments[1:5], *arguments[7:9])
-        before = [values.copy() for values in state]
-        SOLVE(*arguments)
-        if arguments[5].max() > 60.0:
-            for values, kept in zip(state, before, strict=True):
+    def gives_up(arm, lanes, drive, load, threads=1, heat=None):
+        before = [values.copy() for values in lanes]
+        report = SOLVE(arm, lanes, drive, load, threads, heat)
+        if drive.max() > 60.0:
+            for values, kept in zip(lanes, before, strict=True):
                 values[:] = kept
-            arguments[9][:] = 0.0
-            arguments[9][:, 0] = core.FAILED
+            report["rung"] = Rung.FAILED
+        return report
 
-    monkeypatch.setattr(ladder, "solve", gives_up)
+    monkeypatch.setattr(continuation, "solve", gives_up)
     run = torture.drive("reach", "all-on", 400)
     assert 400 - run.rungs.sum() == len(run.failed)
     assert 20 < len(run.failed) <= 100
     for start, end, payload in run.failed:
         assert end.max() > 60.0 >= start.max() > 49.0 and payload == 2.1e-3
-    assert int(torture.row(run)[torture.HEADER.index("failed")]) == len(run.failed)
+    (column,) = (column for column in torture.COLUMNS if column.name == "failed")
+    assert column.of(run) == len(run.failed)
     assert f"{len(run.failed)} solves failed" in torture.report([run])
 
 
@@ -136,7 +139,7 @@ def test_falls_are_counted_and_looked_at(monkeypatch):
 
 
 def test_stability_is_that_of_the_equilibrium():
-    lanes = TASKS["reach"]("train", 1e-5).core(2)
+    lanes = registry.entry("reach").new().core(2)
     for _ in range(10):
         lanes.step(np.array([[1.0, -1.0, -1.0], [-1.0, 1.0, 0.0]]))
     record = lanes.record
@@ -150,12 +153,13 @@ def test_stability_is_that_of_the_equilibrium():
 
 
 def test_numbers_that_are_not_finite_are_found(monkeypatch, no_goals):
-    def breaks(*arguments):
-        SOLVE(*arguments)
-        if arguments[5].max() > 130.0:
-            arguments[8][:] = np.nan  # path lengths, which are not observed
+    def breaks(arm, lanes, drive, load, threads=1, heat=None):
+        report = SOLVE(arm, lanes, drive, load, threads, heat)
+        if drive.max() > 130.0:
+            lanes.length[:] = np.nan  # path lengths, which are not observed
+        return report
 
-    monkeypatch.setattr(ladder, "solve", breaks)
+    monkeypatch.setattr(continuation, "solve", breaks)
     run = torture.drive("reach", "random", 1000)
     assert 0 < (~run.finite).sum() < 1000
     assert f"{(~run.finite).sum()} steps left a number that is not finite" in torture.report([run])
@@ -165,10 +169,10 @@ def test_a_slow_solve_is_found_with_its_temperatures(monkeypatch, no_goals):
     """Time that the solver computes counts; time that it only waits does not, but on the clock."""
     slow = []
 
-    def dawdles(*arguments):
-        start = arguments[3][0].copy()
-        SOLVE(*arguments)
-        end = arguments[5][0].copy()
+    def dawdles(arm, lanes, drive, load, threads=1, heat=None):
+        start = lanes.drive[0].copy()
+        report = SOLVE(arm, lanes, drive, load, threads, heat)
+        end = drive[0].copy()
         if end.max() > 60.0 and not slow:
             slow.append((start, end))
             begun = time.thread_time()
@@ -177,8 +181,9 @@ def test_a_slow_solve_is_found_with_its_temperatures(monkeypatch, no_goals):
         if end.max() > 80.0 and len(slow) == 1:
             slow.append(end)
             time.sleep(0.08)
+        return report
 
-    monkeypatch.setattr(ladder, "solve", dawdles)
+    monkeypatch.setattr(continuation, "solve", dawdles)
     run = torture.drive("reach", "all-on", 300)
     assert 0.03 <= run.cpu.max() < 0.06 and run.wall.max() > 0.08
     assert np.array_equal(run.slowest.start, slow[0][0]) and np.array_equal(run.slowest.end, slow[0][1])
@@ -187,7 +192,9 @@ def test_a_slow_solve_is_found_with_its_temperatures(monkeypatch, no_goals):
 
 def test_the_study_writes_a_table_and_a_page(tmp_path, monkeypatch):
     monkeypatch.setattr(torture, "QUICK", 20)
-    page = torture.run(tmp_path, quick=True)
+    runs = torture.measure(quick=True)
+    page = torture.report(runs)
+    pattern.save_table(tmp_path / "torture.csv", torture.COLUMNS, runs)
     with (tmp_path / "torture.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [(row["task"], row["policy"]) for row in rows] == [(task, policy) for task in TASKS for policy in torture.POLICIES]

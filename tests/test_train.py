@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import pickle
 import shutil
 import signal
@@ -18,6 +19,8 @@ from stable_baselines3 import PPO, SAC
 
 import agents
 import train
+from agents import training
+from agents.curve import shortfall
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.filterwarnings("ignore:rich is experimental")  # SB3's progress bar
@@ -66,6 +69,13 @@ def test_a_run_can_be_watched_in_tensorboard(trained):
     assert step == float(last["steps"]) and distance == pytest.approx(float(last["final_distance_mm"]))
 
 
+def test_the_policy_kept_came_nearest_or_has_the_largest_return():
+    rows = [{"final_distance_mm": d, "episode_return": r} for d, r in ((2.0, -2.0), (1.0, -3.0), (3.0, -1.0))]
+    assert min(rows, key=shortfall) is rows[1]
+    blank = [{**row, "final_distance_mm": float("nan")} for row in rows]
+    assert min(blank, key=shortfall) is blank[2]
+
+
 def test_progress_is_shown(trained):
     _, done = trained
     assert "3264/3,264" in (done.stdout + done.stderr).replace("3,264/3,264", "3264/3,264")
@@ -90,7 +100,7 @@ def test_resume_goes_on_with_its_seed(trained, tmp_path):
 @pytest.fixture
 def quickly(monkeypatch):
     """The command line in this process; points of the learning curve cost one episode."""
-    monkeypatch.setattr(train, "CURVE_EPISODES", 1)
+    monkeypatch.setattr(training, "CURVE_EPISODES", 1)
     return lambda *arguments: train.main([*map(str, arguments), "--episodes", "1"])
 
 
@@ -101,7 +111,7 @@ def steps_of(folder):
 
 def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint_to_its_end(quickly, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "killed"
-    often = "import sys, train; train.CURVE_EPISODES = 1; train.CURVE_INTERVAL = 320; train.main(sys.argv[1:])"
+    often = "import sys, train; t = train.training; t.CURVE_EPISODES = 1; t.CURVE_INTERVAL = 320; train.main(sys.argv[1:])"
     command = [sys.executable, "-c", often, "--algo", "sac", "--steps", "2240", "--seed", "5", "--out", str(folder)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
@@ -160,12 +170,36 @@ def test_dagger_imitates_the_controller_and_goes_on_with_its_record(quickly, tmp
     assert report["held_out"]["scripted"]["success_rate"] == 1.0
 
 
+@pytest.fixture
+def on_path(monkeypatch):
+    """The folder of `toy.py`, a module of a user, is on the path of other processes."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(ROOT / "tests"), os.environ.get("PYTHONPATH")])))
+
+
+def test_a_users_task_is_trained_with_default_settings_and_evaluated_without_a_controller(toy, on_path, tmp_path, capsys):
+    folder = tmp_path / "turn"
+    done = run("--task", "toy:turn", "--steps", 400, "--episodes", 2, "--out", folder)
+    assert done.returncode == 0, done.stderr
+    description, report = (json.loads((folder / name).read_text()) for name in ("policy.json", "report.json"))
+    assert (description["task"], description["env"], description["algo"]) == ("toy:turn", "toy:ToyTurnDense-v0", "ppo")
+    assert set(report["held_out"]) == {"ppo", "random"}
+    assert report["held_out"]["ppo"]["final_distance_mm"] is None and "mm" not in done.stdout
+    assert steps_of(folder)[-1] == 6400
+    done = run("--eval-only", folder, "--episodes", 2)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((folder / "evaluation.json").read_text())["held_out"] == report["held_out"]
+    with pytest.raises(SystemExit):
+        train.main(["--task", "toy:turn", "--algo", "dagger"])
+    message = "--algo dagger: toy:turn has no settings of it; it has those of her, ppo, sac"
+    assert message in capsys.readouterr().err
+
+
 def test_a_fresh_run_leaves_nothing_of_an_earlier_one(tmp_path, monkeypatch):
     folder = tmp_path / "again"
     folder.mkdir()
     for name in ("policy.zip", "last.zip", "replay_buffer.pkl", "curve.csv", "report.json", "events.out.tfevents.17.host.3.0"):
         (folder / name).write_text("old")
-    monkeypatch.setattr(train, "train", lambda *arguments: (0.0, True))
+    monkeypatch.setattr(training, "train", lambda *arguments: (0.0, True))
     assert train.main(["--out", str(folder)]) == 130
     assert list(folder.iterdir()) == []
 
@@ -211,6 +245,7 @@ def test_ray_is_needed_for_its_engine_only(monkeypatch, capsys):
     ("arguments", "message"),
     [
         (["--task", "juggle"], "--task juggle: unknown; the tasks are reach, twist-align, pick-and-place"),
+        (["--task", "nowhere:juggle"], "--task nowhere:juggle: No module named 'nowhere'"),
         (["--algo", "dqn"], "--algo dqn: unknown; the algorithms are dagger, her, ppo, sac"),
         (["--steps", "0"], "--steps 0: expected a positive integer"),
         (["--episodes", "-3"], "--episodes -3: expected a positive integer"),

@@ -1,13 +1,14 @@
 """`train.py --tune`: trials are kept, gone on with, given up, and the best one is written as settings are."""
 
-import argparse
 from types import SimpleNamespace
 
 import pytest
 import yaml
 
 import train
-from agents.hyperparameters import HYPERPARAMETERS, for_learner
+from agents import training
+from agents.hyperparameters import ALGORITHMS, for_learner, settings_of
+from agents.training import Job
 
 optuna = pytest.importorskip("optuna", reason="optuna is not installed (extra `tune`)")
 
@@ -27,7 +28,7 @@ def test_trials_are_kept_and_the_best_settings_written(tmp_path, capsys):
     assert [trial.number for trial in study.trials] == [0, 1, 2]
     ((env, best),) = yaml.safe_load((tmp_path / "best.yml").read_text()).items()
     assert {"env": env, **best} == study.best_trial.user_attrs["settings"]
-    present = HYPERPARAMETERS["reach"]["sac"]
+    present = settings_of("reach")["sac"]
     assert env == present["env"] and best["n_timesteps"] == present["n_timesteps"]
     assert for_learner(best)["learning_rate"](1.0) == pytest.approx(study.best_params["learning_rate"], rel=0.05)
     assert "trial 2: return " in capsys.readouterr().out
@@ -35,17 +36,16 @@ def test_trials_are_kept_and_the_best_settings_written(tmp_path, capsys):
 
 @pytest.mark.parametrize("algorithm", list(tuning.SPACES))
 def test_what_is_tried_is_complete_settings_that_learners_take(algorithm):
-    task = next(task for task, entries in HYPERPARAMETERS.items() if algorithm in entries)
-    settings = HYPERPARAMETERS[task][algorithm]
+    settings = settings_of("reach")[algorithm]
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(3):
         tried = tuning.SPACES[algorithm](study.ask(), settings)
         assert set(tried) <= {*settings, "tau"}
-        train.build(algorithm, {**settings, **tried}, argparse.Namespace(engine="sb3", seed=0, device="cpu"))
+        training.build(Job("reach", algorithm, {**settings, **tried}))
 
 
 def test_every_algorithm_has_a_space():
-    assert set(tuning.SPACES) == {algorithm for entries in HYPERPARAMETERS.values() for algorithm in entries}
+    assert set(tuning.SPACES) == set(ALGORITHMS)
 
 
 @pytest.mark.parametrize("pruned", [False, True])

@@ -4,12 +4,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import tca_envs  # noqa: F401
-from tca_envs import batch
+from tca_envs import registry
 from tca_envs.mechanics import thermal
 from tca_envs.mechanics.thermal import AMBIENT, SOFT_LIMIT
 from tca_envs.tasks.core import STEP_S
-from tca_envs.tasks.twist_align import TwistAlign
 
 
 def goal(x=0.0, y=0.0, z=6.0, yaw=0.0):
@@ -17,7 +15,7 @@ def goal(x=0.0, y=0.0, z=6.0, yaw=0.0):
 
 
 def test_a_goal_is_the_tip_and_yaw_that_steady_powers_reach():
-    task = TwistAlign("train")
+    task = registry.entry("twist-align").new()
     core = task.core(1)
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -33,12 +31,12 @@ def test_a_goal_is_the_tip_and_yaw_that_steady_powers_reach():
 
 @pytest.mark.parametrize("split", ["train", "held-out"])
 def test_goals_come_from_their_split_and_are_all_reached_within_a_turn(split):
-    task = TwistAlign(split)
+    task = registry.entry("twist-align").new(split=split)
     core = task.core(1)
     drawn = []
     settle = core.settle
     core.settle = lambda temperature: (drawn.extend(temperature), settle(temperature))[1]
-    goals, scenes = task.draw(core, np.random.default_rng(0).spawn(40))
+    goals, scenes = task.sample(core, np.random.default_rng(0).spawn(40))
     assert scenes.shape == (40, 0)
     assert all(task.of_this_split(temperature) for temperature in drawn)
     np.testing.assert_allclose(np.hypot(goals[:, 3], goals[:, 4]), 1.0, atol=1e-12)
@@ -63,17 +61,17 @@ def test_goals_come_from_their_split_and_are_all_reached_within_a_turn(split):
     ids=str,
 )
 def test_success_takes_1_5_millimetres_and_5_degrees(achieved, success):
-    task = TwistAlign("train")
-    assert bool(batch.outcome(task, achieved, goal()).success) is success
+    task = registry.entry("twist-align").new()
+    assert bool(task.outcome(achieved, goal()).success) is success
     sparse = gym.make("TCATwistAlign-v0").unwrapped
     assert sparse.compute_reward(achieved, goal(), {}) == (0.0 if success else -1.0)
 
 
 @pytest.mark.parametrize("turn", [-359.0, -200.0, -179.0, 0.0, 91.0, 178.0])
 def test_yaw_errors_do_not_depend_on_where_the_circle_is_cut(turn):
-    task = TwistAlign("train")
+    task = registry.entry("twist-align").new()
     for error in (0.0, 3.0, -90.0, 179.0):
-        found = batch.outcome(task, goal(yaw=turn + error), goal(yaw=turn)).measures
+        found = task.outcome(goal(yaw=turn + error), goal(yaw=turn)).measures
         assert found["yaw_error_deg"] == pytest.approx(abs(error), abs=1e-9)
 
 

@@ -14,12 +14,10 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
-import tca_envs  # noqa: F401
-from tca_envs.mechanics import grasp, kernels
+from tca_envs import batch, registry
+from tca_envs.mechanics import Rung, continuation, grasp
 from tca_envs.tasks import core
-from tca_envs.tasks.pick_and_place import PickAndPlace
 from tca_envs.tasks.reach import Reach
-from tca_envs.tasks.twist_align import TwistAlign
 from tca_envs.vector import ArmVectorEnv
 
 IDS = sorted(name for name, spec in gym.registry.items() if "tca_envs" in str(spec.entry_point))
@@ -63,22 +61,27 @@ def assert_same(first, second, where="result"):
 @pytest.fixture
 def failing(monkeypatch):
     """A solver that has no answer where the first TCA is hotter than 50 degC; goals are drawn without one."""
-    solve = core.ladder.solve
+    solve = continuation.solve
 
-    def solve_or_fail(arm, strain, tension, drive, load, asked, new_load, tip, lengths, report, *rest):
-        state = (strain, tension, drive, load, tip, lengths)
-        before = [values.copy() for values in state]
-        solve(arm, *state[:4], asked, new_load, tip, lengths, report, *rest)
+    def solve_or_fail(arm, lanes, asked, *rest):
+        before = [values.copy() for values in lanes]
+        report = solve(arm, lanes, asked, *rest)
         bad = asked[:, 0] > 50.0
-        for values, kept in zip(state, before, strict=True):
+        for values, kept in zip(lanes, before, strict=True):
             values[bad] = kept[bad]
-        report[bad] = (kernels.FAILED, 1.0, 7, 0, 0)
+        report["rung"][bad], report["residual"][bad], report["iterations"][bad], report["jumped"][bad] = (
+            Rung.FAILED,
+            1.0,
+            7,
+            False,
+        )
+        return report
 
-    def draw(task, core, generators):
+    def sample(task, core, generators):
         return np.array([generator.random(3) for generator in generators]), np.empty((len(generators), 0))
 
-    monkeypatch.setattr(core.ladder, "solve", solve_or_fail)
-    monkeypatch.setattr(Reach, "draw", draw)
+    monkeypatch.setattr(batch, "new_solver", lambda solver: solve_or_fail)
+    monkeypatch.setattr(Reach, "sample", sample)
 
 
 def test_every_id_has_its_native_vector_environment():
@@ -239,7 +242,8 @@ def test_lanes_that_start_anew_rest_meanwhile():
 
 def test_each_lane_draws_until_it_is_content_and_then_no_more(monkeypatch):
     """Drawn in rounds with others, each episode is what its generator makes of it alone, for all tasks."""
-    for task in (Reach("train"), TwistAlign("held-out"), PickAndPlace("train")):
+    for name, split in (("reach", "train"), ("twist-align", "held-out"), ("pick-and-place", "train")):
+        task = registry.entry(name).new(split=split)
         arms, settle, rejected = task.core(1), core.Core.settle, []
 
         def cool(arms, temperature, payload=None, settle=settle, rejected=rejected):
@@ -249,24 +253,25 @@ def test_each_lane_draws_until_it_is_content_and_then_no_more(monkeypatch):
 
         monkeypatch.setattr(core.Core, "settle", cool)
         together, alone = ([np.random.default_rng(i) for i in range(12)] for _ in range(2))
-        goals, scenes = task.draw(arms, together)
+        goals, scenes = task.sample(arms, together)
         assert len(rejected) > 1 and sum(rejected) > 3
         for i, generator in enumerate(alone):
-            goal, scene = task.draw(arms, [generator])
+            goal, scene = task.sample(arms, [generator])
             assert goal.tobytes() == goals[i].tobytes() and scene.tobytes() == scenes[i].tobytes()
             assert generator.random() == together[i].random()
         monkeypatch.setattr(core.Core, "settle", settle)
 
 
 def test_an_arm_that_falls_on_the_way_is_not_settled(monkeypatch):
-    arms, solve, calls = Reach("train").core(1), core.ladder.solve, []
+    arms, solve, calls = registry.entry("reach").new().core(1), continuation.solve, []
 
     def falls_once(*arguments):
-        solve(*arguments)
+        report = solve(*arguments)
         calls.append(arguments)
-        arguments[9][1, 3] = len(calls) == 2  # of the report
+        report["jumped"][1] = len(calls) == 2
+        return report
 
-    monkeypatch.setattr(core.ladder, "solve", falls_once)
+    monkeypatch.setattr(arms, "solve", falls_once)
     record, good = arms.settle(np.full((3, 3), 60.0))
     assert good.tolist() == [True, False, True] and len(calls) == len(core.RAMP)
     np.testing.assert_array_equal(record.temperature, 60.0)

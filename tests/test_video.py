@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import train
-from agents import video
-from agents.scripted import CONTROLLERS, RandomPolicy
+from agents import training, video
+from agents.scripted import RandomPolicy, controller_of
 
 pytestmark = pytest.mark.usefixtures("drawing")
 
@@ -19,13 +19,13 @@ def env(name="TCAReach-v0", **options):
 
 def test_episodes_are_shown_until_their_goals_are_held():
     made = env()
-    shown = video.frames(CONTROLLERS["reach"](), made, episodes=2, seed=1)
+    shown = video.frames(controller_of("reach"), made, episodes=2, seed=1)
     lengths = []
     for seed in (1, 2):  # the same without pictures
         observation, info = made.reset(seed=seed)
         held, steps = 0, 0
         while held < video.HELD_STEPS:
-            observation, *_, info = made.step(CONTROLLERS["reach"]().predict(observation)[0])
+            observation, *_, info = made.step(controller_of("reach").predict(observation)[0])
             held, steps = (held + 1 if info["is_success"] else 0), steps + 1
         lengths.append(steps + 1)
     assert len(shown) == sum(lengths)
@@ -67,7 +67,7 @@ def test_other_formats_are_refused(tmp_path):
 
 def test_the_command_line_films_a_policy(tmp_path, capsys, monkeypatch):
     pytest.importorskip("moviepy", reason='MoviePy is missing: pip install -e ".[video]"')
-    monkeypatch.setattr(train, "FILMED_EPISODES", 1)
+    monkeypatch.setattr(training, "FILMED_EPISODES", 1)
     path = tmp_path / "out.mp4"
     filmed, frames = [], video.frames
     monkeypatch.setattr(video, "frames", lambda policy, env, *how: filmed.append(env) or frames(policy, env, *how))

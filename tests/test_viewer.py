@@ -123,8 +123,8 @@ def test_history_is_the_last_half_minute():
 
 @pytest.mark.parametrize("controller", ["scripted", "pretrained"])
 def test_others_can_drive(controller):
-    if module.CONTROLLERS[controller].missing():
-        pytest.skip(f"{controller}: {module.CONTROLLERS[controller].missing()}")
+    if missing := module.CONTROLLERS[controller].missing("reach"):
+        pytest.skip(f"{controller}: {missing}")
     session = Session("reach", seed=1)
     session.drive_by(controller)
     session.step()
@@ -144,8 +144,8 @@ def test_others_can_drive(controller):
 
 def test_a_controller_that_is_not_there_says_what_is_missing(monkeypatch):
     monkeypatch.setattr(module, "find_spec", lambda name: None)
-    assert module.CONTROLLERS["scripted"].missing() == "needs the package `agents` of a checkout"
-    assert "agents" in module.CONTROLLERS["pretrained"].missing()
+    assert module.CONTROLLERS["scripted"].missing("reach") == "needs the package `agents` of a checkout"
+    assert "agents" in module.CONTROLLERS["pretrained"].missing("reach")
     session = Session("reach")
     with pytest.raises(ValueError, match=r"controller = 'scripted': expected one of 'manual'$"):
         session.drive_by("scripted")
@@ -154,7 +154,7 @@ def test_a_controller_that_is_not_there_says_what_is_missing(monkeypatch):
 
 def test_without_stable_baselines_there_is_no_pretrained_policy(monkeypatch):
     monkeypatch.setattr(module, "find_spec", lambda name: None if name == "stable_baselines3" else find_spec(name))
-    assert module.CONTROLLERS["pretrained"].missing() == 'needs pip install "tca_envs[train]"'
+    assert module.CONTROLLERS["pretrained"].missing("reach") == 'needs pip install "tca_envs[train]"'
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,10 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from tca_envs import presets
-from tca_envs.mechanics import TCA, Arm, Module, Muscle, Payload, section, shooting
-from tca_envs.mechanics.rotation import yaw, yaw_angle
+from study import shooting
+from tca_envs.mechanics import TCA, Arm, Module, Muscle, Payload, section
+from tca_envs.robots import paper
+from tca_envs.rotation import yaw, yaw_angle
 
 LAWS = pytest.mark.parametrize("law", [TCA.hardware(), TCA.paper()], ids=["hardware", "paper"])
 
@@ -49,7 +50,7 @@ def twisted(module, strain):
 @pytest.mark.parametrize("temperature", [25.0, 60.0, 100.0, 150.0])
 def test_the_twisting_module_alone_is_its_closed_form(law, temperature):
     """Without load: one scalar equation for the tension around six algebraic ones."""
-    module = presets.twisting_module(law)
+    module = paper.twisting_module(law)
     rest = module.rest_length(module.muscles[0])
 
     def mismatch(tension):
@@ -64,7 +65,7 @@ def test_the_twisting_module_alone_is_its_closed_form(law, temperature):
 
 def test_the_twist_is_that_of_the_prototype():
     """-82/-146/-239 degrees at 100/125/150 degC: a shooting prototype of the same module, to a degree."""
-    arm, start, turned = presets.whole_arm(), None, []
+    arm, start, turned = paper.whole_arm(), None, []
     for temperature in range(25, 151, 5):
         start = arm.equilibrium([25.0, 25.0, 25.0, temperature], start=start)
         turned.append(float(yaw_angle(start.tip_pose)))
@@ -74,7 +75,7 @@ def test_the_twist_is_that_of_the_prototype():
 
 @pytest.mark.parametrize("bending", [(25.0, 25.0, 25.0), (110.0, 25.0, 60.0), (90.0, 90.0, 90.0)], ids=str)
 def test_heating_the_helix_turns_the_gripper_one_way_only(bending):
-    arm, start, turned = presets.whole_arm(), None, []
+    arm, start, turned = paper.whole_arm(), None, []
     for temperature in np.arange(25.0, 151.0, 2.5):
         start = arm.equilibrium([*bending, temperature], start=start)
         assert start.converged
@@ -84,13 +85,13 @@ def test_heating_the_helix_turns_the_gripper_one_way_only(bending):
 
 @pytest.mark.parametrize("drive", [(25.0, 25.0, 25.0, 25.0), (110.0, 60.0, 40.0, 80.0), (100.0, 100.0, 30.0, 140.0)], ids=str)
 def test_the_wrench_is_continuous_across_the_joint_and_the_strain_is_not(drive):
-    arm = presets.whole_arm()
+    arm = paper.whole_arm()
     here = arm.equilibrium(drive)
     joint = arm.modules[0].length
     inside, beyond = here.strain([joint - 1e-9, joint])
 
     def carried(module, fraction, strain, tension):
-        routes = np.array([module.route(muscle, fraction) for muscle in module.muscles])
+        routes = np.array([muscle.route(module.length, fraction) for muscle in module.muscles])
         wrench, _ = section.balance(module.stiffness, module.reference_strain, routes, tension, strain, np.zeros(6))
         return wrench
 
@@ -98,7 +99,7 @@ def test_the_wrench_is_continuous_across_the_joint_and_the_strain_is_not(drive):
     below = carried(arm.modules[1], 0.0, beyond, here.tensions[3:])
     np.testing.assert_allclose(above, below, atol=1e-7 * np.abs(above).max() + 1e-9)
     # It is the weight that hangs there.
-    hanging = (presets.TWISTING_MASS + presets.GRIPPER_MASS) * 9.81
+    hanging = (paper.TWISTING_MASS + paper.GRIPPER_MASS) * 9.81
     np.testing.assert_allclose(np.linalg.norm(below[3:]), hanging, rtol=1e-9)
     if max(drive) > 25.0:
         assert np.abs(inside[:3] - beyond[:3]).max() > 1.0
@@ -107,13 +108,13 @@ def test_the_wrench_is_continuous_across_the_joint_and_the_strain_is_not(drive):
 def test_turning_arm_and_temperatures_turns_the_answer():
     """The bending TCAs lie 120 degrees apart: passing temperatures on and turning the helix along turns everything."""
     turn = Rotation.from_rotvec([0.0, 0.0, 2.0 * np.pi / 3.0]).as_matrix()
-    arm = presets.whole_arm()
-    helix = Muscle(presets.TWISTING_OFFSET, 2.0 * np.pi / 3.0, presets.TWISTING_TURNS, TCA())
+    arm = paper.whole_arm()
+    helix = Muscle(paper.TWISTING_OFFSET, 2.0 * np.pi / 3.0, paper.TWISTING_TURNS, TCA())
     twisting = Module.cylinder(
-        presets.TWISTING_LENGTH, presets.BODY_DIAMETER, presets.YOUNGS_MODULUS, presets.SHEAR_MODULUS, presets.TWISTING_MASS,
+        paper.TWISTING_LENGTH, paper.BODY_DIAMETER, paper.YOUNGS_MODULUS, paper.SHEAR_MODULUS, paper.TWISTING_MASS,
         [helix],
     )  # fmt: skip
-    turned = Arm([presets.bending_module(), twisting], presets.GRAVITY, arm.payload, arm.grids, residual_tolerance=1e-9)
+    turned = Arm([paper.bending_module(), twisting], paper.GRAVITY, arm.payload, arm.grids, residual_tolerance=1e-9)
     arm = Arm(arm.modules, arm.gravity, arm.payload, arm.grids, residual_tolerance=1e-9)
     for a, b, c, d in ((110.0, 60.0, 40.0, 80.0), (25.0, 120.0, 25.0, 140.0)):
         first, second = arm.equilibrium([a, b, c, d]), turned.equilibrium([c, a, b, d])
@@ -122,7 +123,7 @@ def test_turning_arm_and_temperatures_turns_the_answer():
 
 
 def test_the_papers_method_agrees_on_two_modules():
-    arm = presets.whole_arm()
+    arm = paper.whole_arm()
     for drive in ((40.0, 25.0, 25.0, 60.0), (100.0, 100.0, 30.0, 100.0)):
         ours = arm.equilibrium(drive)
         theirs = shooting.equilibrium(arm, drive, start=ours, rtol=1e-6)
@@ -133,7 +134,7 @@ def test_the_papers_method_agrees_on_two_modules():
 
 def test_jumps_from_anywhere_to_anywhere_find_an_equilibrium():
     """All corners of temperature space, cold and from each other."""
-    arm = presets.whole_arm()
+    arm = paper.whole_arm()
     corners = [np.array(corner) for corner in itertools.product((25.0, 158.0), repeat=4)]
     start = None
     for corner in np.random.default_rng(0).permutation(np.array(corners * 2)):
@@ -144,14 +145,14 @@ def test_jumps_from_anywhere_to_anywhere_find_an_equilibrium():
 
 def test_an_object_in_the_jaws_hangs_at_its_place():
     """Weights add up, and the tangent of the straight arm's tip shows the lever of the object beside the axis."""
-    empty, full = presets.whole_arm(), presets.whole_arm(payload=presets.with_object())
+    empty, full = paper.whole_arm(), paper.whole_arm(payload=paper.with_object())
     cold = np.full(4, 25.0)
     assert full.equilibrium(cold).tip_pose[2, 3] > empty.equilibrium(cold).tip_pose[2, 3] + 1e-4
-    held = presets.with_object((0.0, 2e-3, presets.JAW_DEPTH + 1e-3))
+    held = paper.with_object((0.0, 2e-3, paper.JAW_DEPTH + 1e-3))
     assert held.mass == pytest.approx(2.4e-3)
-    moment = presets.GRIPPER_MASS * np.array(presets.GRIPPER_CENTRE) + 1.5e-3 * np.array([0.0, 2e-3, presets.JAW_DEPTH + 1e-3])
+    moment = paper.GRIPPER_MASS * np.array(paper.GRIPPER_CENTRE) + 1.5e-3 * np.array([0.0, 2e-3, paper.JAW_DEPTH + 1e-3])
     np.testing.assert_allclose(held.mass * np.array(held.centre), moment)
-    aside = presets.whole_arm(payload=held).equilibrium(cold).tip_pose
+    aside = paper.whole_arm(payload=held).equilibrium(cold).tip_pose
     # The arm swings until the common centre hangs under the base.
     assert aside[1, 3] < -1e-4
     assert abs(aside[1, 3] + aside[1, :3] @ held.centre) < 0.5 * abs(aside[1, 3])

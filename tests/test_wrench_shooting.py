@@ -5,11 +5,11 @@ import time
 import numpy as np
 import pytest
 
+from study.method import State
+from study.methods.wrench_shooting import METHOD, Guess
+from study.reference import reference
 from tca_envs.mechanics import TCA, Arm, Module, Muscle, Payload, Spring, Tendon
-from tca_envs.presets import BELOW_BENDING, GRAVITY, bending_arm, bending_module, whole_arm
-from tca_envs.study.method import State
-from tca_envs.study.methods.wrench_shooting import METHOD, Guess
-from tca_envs.study.reference import reference
+from tca_envs.robots.paper import BELOW_BENDING, GRAVITY, bending_arm, bending_module, whole_arm
 
 
 def mixed_arm():

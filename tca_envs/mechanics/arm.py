@@ -1,187 +1,36 @@
 """The arm as data: muscles in modules, modules in series, what hangs from the tip; and its equilibrium."""
 
-import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import cache, cached_property
+from dataclasses import dataclass
+from functools import cached_property
 from math import ceil
 from operator import index as as_integer
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tca_envs.mechanics import check, closed_form, kernels, ladder, section
-from tca_envs.mechanics.collocation import JACOBIAN, SHAPE, Model, compile_kernels, flat, linearise, solve_lanes
-from tca_envs.mechanics.equilibrium import Equilibrium, Rung
-from tca_envs.mechanics.kernels import CLOSED_FORM, DESCENT, FAILED, FINER, LOAD, PAYLOAD_MASS, REPORT, SUBSTEPS, WARM
-from tca_envs.mechanics.ladder import TIME_LIMIT_S, Lane
-from tca_envs.mechanics.muscle import PARAMETERS, Muscle
+from tca_envs.mechanics import check, continuation, loads, section
+from tca_envs.mechanics.continuation import Lane
+from tca_envs.mechanics.equilibrium import Equilibrium
+from tca_envs.mechanics.grid import MAX_NODES, Grid, carried, gauss, integrals
+from tca_envs.mechanics.laws import PARAMETERS
+from tca_envs.mechanics.loads import Payload
+from tca_envs.mechanics.module import Module
+from tca_envs.mechanics.rungs import Rung
+from tca_envs.mechanics.solver import Model, Problem, linearise, prepare
 
 Array = NDArray[np.float64]
-ArrayOf3 = tuple[float, float, float]
-ZERO: ArrayOf3 = (0.0, 0.0, 0.0)
-EYE = np.eye(4)[np.newaxis]
-LADDER = tuple(Rung)
-RUNGS = {
-    SUBSTEPS: "substeps in drive and load",
-    FINER: "substeps on a finer grid",
-    DESCENT: "a fall from the end of the start's branch",
+ZERO = (0.0, 0.0, 0.0)
+HOW = {
+    Rung.SUBSTEPS: "substeps in drive and load",
+    Rung.FINER: "substeps on a finer grid",
+    Rung.DESCENT: "a fall from the end of the start's branch",
 }
-STRAIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Module:
-    """A soft rod with muscles in it.
-
-    Parameters
-    ----------
-    length : float
-        Length of the unloaded centerline [m].
-    stiffness : (6,) array
-        Diagonal of K: EI_x, EI_y, GJ [N m2], GA, GA, EA [N], eq. (3).
-    mass_per_length : float
-        [kg/m].
-    muscles : sequence of Muscle
-        Each runs from the module's base to its end.
-    reference_strain : (6,) array
-        xi* = [u*; v*], uniform: strain of the unloaded rod [1/m, 1].
-
-    Raises
-    ------
-    ValueError
-        For a non-positive length or stiffness, a negative mass, non-finite numbers, wrong shapes, or a muscle whose path
-        shrinks to a point in the unloaded rod.
-    """
-
-    length: float
-    stiffness: Array
-    mass_per_length: float = 0.0
-    muscles: Sequence[Muscle] = ()
-    reference_strain: Array = field(default_factory=lambda: np.array(STRAIGHT))
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "length", check.scalar("length", self.length, 0.0, above=True))
-        stiffness = check.array("stiffness", self.stiffness, (6,))
-        if not (stiffness > 0.0).all():
-            raise ValueError(f"stiffness = {self.stiffness!r}: expected six positive numbers EI_x, EI_y, GJ, GA, GA, EA")
-        reference = check.array("reference_strain", self.reference_strain, (6,))
-        if not reference[5] > 0.0:
-            raise ValueError(f"reference_strain = {self.reference_strain!r}: expected v*_z > 0, the rod's own direction")
-        object.__setattr__(self, "mass_per_length", check.scalar("mass_per_length", self.mass_per_length, 0.0))
-        try:
-            muscles = tuple(self.muscles)
-        except TypeError:
-            raise ValueError(f"muscles = {self.muscles!r}: expected a sequence of Muscle") from None
-        for i, muscle in enumerate(muscles):
-            if not isinstance(muscle, Muscle):
-                raise ValueError(f"muscles[{i}] = {muscle!r}: expected a Muscle")
-        if len(muscles) > MOST_MUSCLES:
-            raise ValueError(f"muscles = {self.muscles!r}: expected at most {MOST_MUSCLES} in a module")
-        for values in (stiffness, reference):
-            values.setflags(write=False)
-        object.__setattr__(self, "stiffness", stiffness)
-        object.__setattr__(self, "reference_strain", reference)
-        object.__setattr__(self, "muscles", muscles)
-        fractions = np.linspace(0.0, 1.0, 181)
-        for i, muscle in enumerate(muscles):
-            shortest = self._stretch(muscle, fractions).min()
-            if not shortest > 1e-3:
-                raise ValueError(
-                    f"muscles[{i}] = {muscle!r}: expected a path that runs along the module; with reference_strain "
-                    f"{reference.tolist()} it shrinks to {shortest:.3g} m per metre of centerline"
-                )
-
-    @classmethod
-    def cylinder(
-        cls,
-        length: float,
-        diameter: float,
-        youngs_modulus: float,
-        shear_modulus: float,
-        mass: float = 0.0,
-        muscles: Sequence[Muscle] = (),
-        curvature: ArrayOf3 = ZERO,
-    ) -> "Module":
-        """Return a module of round section: EI = E pi d^4/64, GJ = G pi d^4/32, GA, EA with A = pi d^2/4.
-
-        Parameters
-        ----------
-        length, diameter : float
-            [m].
-        youngs_modulus, shear_modulus : float
-            [Pa].
-        mass : float
-            Of the whole module [kg].
-        muscles : sequence of Muscle
-            Each runs from the module's base to its end.
-        curvature : (3,) array
-            u* [1/m]: curvature of the unloaded rod about x, y and its twist.
-        """
-        length = check.scalar("length", length, 0.0, above=True)
-        diameter = check.scalar("diameter", diameter, 0.0, above=True)
-        e = check.scalar("youngs_modulus", youngs_modulus, 0.0, above=True)
-        g = check.scalar("shear_modulus", shear_modulus, 0.0, above=True)
-        mass = check.scalar("mass", mass, 0.0)
-        u = check.array("curvature", curvature, (3,))
-        area, inertia = np.pi * diameter**2 / 4.0, np.pi * diameter**4 / 64.0
-        stiffness = np.array([e * inertia, e * inertia, 2.0 * g * inertia, g * area, g * area, e * area])
-        return cls(length, stiffness, mass / length, muscles, np.array([*u, 0.0, 0.0, 1.0]))
-
-    def route(self, muscle: Muscle, fraction: float | Array) -> Array:
-        """Return x, y [m] of a muscle in the section and their derivatives in s, at s = fraction * length; (..., 4)."""
-        rate = 2.0 * np.pi * muscle.turns / self.length
-        angle = muscle.angle + rate * self.length * fraction
-        x, y = muscle.offset * np.cos(angle), muscle.offset * np.sin(angle)
-        return np.stack([x, y, -rate * y, rate * x], axis=-1)
-
-    def _stretch(self, muscle: Muscle, fractions: Array) -> Array:
-        """Return |p_a'| of the unloaded rod, eq. (13)."""
-        x, y, dx, dy = self.route(muscle, fractions).T
-        u, v = self.reference_strain[:3], self.reference_strain[3:]
-        return np.linalg.norm([v[0] - u[2] * y + dx, v[1] + u[2] * x + dy, v[2] + u[0] * y - u[1] * x], axis=0)
-
-    def rest_length(self, muscle: Muscle) -> float:
-        """Return the path length of a muscle in the unloaded rod [m], l* of eq. (24), by Gauss quadrature."""
-        points, weights = legendre_nodes(64)
-        return 0.5 * self.length * float(weights @ self._stretch(muscle, 0.5 * (points + 1.0)))
-
-
-@dataclass(frozen=True)
-class Payload:
-    """A rigid body that hangs from the tip.
-
-    Parameters
-    ----------
-    mass : float
-        [kg].
-    centre : (3,) tuple
-        Its centre of mass in the frame of the arm's last cross section [m].
-    """
-
-    mass: float
-    centre: ArrayOf3 = ZERO
-
-    def __post_init__(self) -> None:
-        check.scalar("mass", self.mass, 0.0)
-        check.array("centre", self.centre, (3,))
-
-
-class Grid(NamedTuple):
-    """How a module is discretised: `elements` of equal length with `nodes` Gauss nodes each."""
-
-    elements: int
-    nodes: int
-
-
-MAX_NODES = 16
 FINE_ENOUGH = 1000
 """Nodes of an arm beyond which `Arm.finer` is no finer."""
 MOST_NODES = 10_000
 """Of an arm: a few iterations of Newton still fit into a second."""
-MOST_MUSCLES = 32
-"""Of a module, for the same reason."""
 
 
 @dataclass(frozen=True)
@@ -194,8 +43,6 @@ class Discretisation:
         One for each module.
     residual_tolerance : float
         Newton stops when `Equilibrium.residual` is below it.
-    closed_form : bool
-        Whether nothing is integrated where nothing loads the arm.
     tolerance, error : float or None
         Tip error that was asked for and its estimate [m]; None if grids were given and nothing was estimated.
     states : int
@@ -204,7 +51,6 @@ class Discretisation:
 
     grids: tuple[Grid, ...]
     residual_tolerance: float
-    closed_form: bool
     tolerance: float | None = None
     error: float | None = None
     states: int = 0
@@ -212,65 +58,11 @@ class Discretisation:
     def __str__(self) -> str:
         lines = [f"module {k}: {e} x {q} Gauss nodes" for k, (e, q) in enumerate(self.grids)]
         lines.append(f"Newton stops at a residual of {self.residual_tolerance:.1e}")
-        lines.append(f"closed form without load: {'yes' if self.closed_form else 'no'}")
         if self.tolerance is None or self.error is None:
             lines.append("tip error: not estimated, the grids were given")
         else:
             lines.append(f"tip error: {self.error:.1e} m estimated from {self.states} states, {self.tolerance:.1e} m asked")
         return "\n".join(lines)
-
-
-@cache
-def legendre_nodes(count: int) -> tuple[Array, Array]:
-    """Return nodes and weights of Gauss quadrature on [-1, 1]."""
-    return np.polynomial.legendre.leggauss(count)
-
-
-@cache
-def gauss(nodes: int) -> tuple[Array, Array, Array]:
-    """Return the Gauss collocation coefficients a (q, q), weights b (q,) and nodes c (q,) on [0, 1]."""
-    x, w = legendre_nodes(nodes)
-    return integrals((x + 1.0) / 2.0, (x + 1.0) / 2.0), w / 2.0, (x + 1.0) / 2.0
-
-
-def integrals(c: Array, x: Array) -> Array:
-    """Return A (len(x), q): integrals from 0 to x of the Lagrange polynomials on the nodes c in [0, 1]."""
-    q = len(c)
-    legendre = np.polynomial.legendre
-    vandermonde = legendre.legvander(2.0 * c - 1.0, q - 1)
-    columns = legendre.legval(2.0 * x - 1.0, legendre.legint(np.eye(q), lbnd=-1.0)) / 2.0
-    return np.asarray(np.linalg.solve(vandermonde.T, columns).T, dtype=np.float64)
-
-
-@cache
-def interpolation(here: Grid, there: Grid) -> tuple[NDArray[np.int64], Array]:
-    """Return what takes values at the nodes of one grid of a module to those of another, `interpolated`.
-
-    Nodes (G', q) of the element that each new node lies in, and the values of their Lagrange polynomials there (G', q).
-    """
-    vandermonde = np.polynomial.legendre.legvander
-    x = ((np.arange(there.elements)[:, np.newaxis] + gauss(there.nodes)[2]) / there.elements * here.elements).ravel()
-    element = np.minimum(x.astype(np.int64), here.elements - 1)
-    basis = vandermonde(2.0 * gauss(here.nodes)[2] - 1.0, here.nodes - 1)
-    values = vandermonde(2.0 * (x - element) - 1.0, here.nodes - 1)
-    weights = np.asarray(np.linalg.solve(basis.T, values.T).T, dtype=np.float64)
-    return element[:, np.newaxis] * here.nodes + np.arange(here.nodes), weights
-
-
-def interpolated(here: Grid, values: Array, there: Grid) -> Array:
-    """Return values (..., G, d) at the nodes of one grid of a module interpolated to those of another, (..., G', d)."""
-    nodes, weights = interpolation(here, there)
-    return np.einsum("gq,...gqd->...gd", weights, values[..., nodes, :])
-
-
-def carried(here: Sequence[Grid], strain: Array, there: Sequence[Grid]) -> Array:
-    """Return strains (..., G, 6) at the nodes of an arm's grids `here` interpolated to those of other grids, (..., G', 6)."""
-    parts, first = [], 0
-    for old, new in zip(here, there, strict=True):
-        last = first + old.elements * old.nodes
-        parts.append(interpolated(old, strain[..., first:last, :], new))
-        first = last
-    return np.ascontiguousarray(np.concatenate(parts, axis=-2))  # kernels are compiled for this layout alone
 
 
 def default_grid(module: Module) -> Grid:
@@ -287,16 +79,11 @@ class Piece(NamedTuple):
     """An element of an arm's grid, and which of some arc positions it holds."""
 
     module: int
-    number: int
-    """Of the element in its module."""
-    node: int
-    """Its first node."""
-    length: float
-    """[m]."""
-    inside: NDArray[np.intp]
-    """Indices of the positions."""
-    fraction: Array
-    """Their places in the element, 0 to 1."""
+    number: int  # of the element in its module
+    node: int  # its first node
+    length: float  # [m]
+    inside: NDArray[np.intp]  # indices of the positions
+    fraction: Array  # their places in the element, 0 to 1
 
 
 class Arm:
@@ -345,23 +132,25 @@ class Arm:
         self.residual_tolerance = check.scalar("residual_tolerance", residual_tolerance, 1e-12, 1e-1)
         self.length = sum(module.length for module in self.modules)
         self.muscles = tuple(muscle for module in self.modules for muscle in module.muscles)
-        self.model, self.node_arc = _compile(self.modules, self.grids, self.residual_tolerance)
-        self.sections = _sections(self.modules, self.grids, self.node_arc)
-        massless = not any(module.mass_per_length for module in self.modules)
-        self._weightless = self.sections is not None and (massless or not self.gravity.any())
-        self.discretisation = Discretisation(self.grids, self.residual_tolerance, self.sections is not None)
+        self.model, self.node_arc = _model(self.modules, self.grids, self.residual_tolerance)
+        self.discretisation = Discretisation(self.grids, self.residual_tolerance)
         ranges = [muscle.law.drive_range() for muscle in self.muscles]
         self._lowest, self._highest = [low for low, _ in ranges], [high for _, high in ranges]
         self._found = f"converged below {self.residual_tolerance:g}"
         self._neutral = np.array(
             [m.law.neutral_drive(rest) for m, rest in zip(self.muscles, self.model.rest_length, strict=True)]
         )
-        self._load = np.zeros(LOAD)
-        self._load[6:9] = self.gravity
+        self._load = np.zeros(loads.SIZE)
+        self._load[loads.GRAVITY] = self.gravity
         if payload is not None:
-            self._load[PAYLOAD_MASS:] = _flat(payload)
+            self._load[loads.PAYLOAD] = _flat(payload)
         per_module = [grid.elements * grid.nodes for grid in self.grids]
         self._unloaded_strain = np.repeat(self.model.reference, per_module, axis=0)
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The arm as the compiled kernels read it."""
+        return prepare(self.model)
 
     @property
     def rest_lengths(self) -> Array:
@@ -381,23 +170,19 @@ class Arm:
         return lane if other is self else lane._replace(strain=carried(self.grids, lane.strain, other.grids))
 
     def load(self, tip_force: ArrayLike = ZERO, tip_moment: ArrayLike = ZERO, payload: Payload | None = None) -> Array:
-        """Return the external load as the flat array of `kernels.LOAD` numbers that the kernels read."""
+        """Return the external load as an array (loads.SIZE,), see `loads`."""
         load = self._load.copy()
         if payload is not None:
-            load[PAYLOAD_MASS:] = _flat(payload)
+            load[loads.PAYLOAD] = _flat(payload)
         if tip_force is not ZERO:
-            load[0:3] = check.array("tip_force", tip_force, (3,))
+            load[loads.FORCE] = check.array("tip_force", tip_force, (3,))
         if tip_moment is not ZERO:
-            load[3:6] = check.array("tip_moment", tip_moment, (3,))
+            load[loads.MOMENT] = check.array("tip_moment", tip_moment, (3,))
         return load
-
-    def unstressed(self, load: Array) -> bool:
-        """Return whether `closed_form` applies: nothing loads the arm, and its modules' strains are uniform then."""
-        return self._weightless and not load[:6].any() and not (load[PAYLOAD_MASS] and self.gravity.any())
 
     def unloaded(self) -> Lane:
         """Return strain (G, 6), tension (n,), drive (n,) and load of the unloaded arm: where every cold start begins."""
-        return Lane(self._unloaded_strain.copy(), np.zeros(len(self.muscles)), self._neutral.copy(), np.zeros(LOAD))
+        return Lane(self._unloaded_strain.copy(), np.zeros(len(self.muscles)), self._neutral.copy(), np.zeros(loads.SIZE))
 
     def equilibrium(
         self,
@@ -406,7 +191,7 @@ class Arm:
         tip_moment: ArrayLike = ZERO,
         start: Equilibrium | None = None,
         payload: Payload | None = None,
-        time_limit_s: float = TIME_LIMIT_S,
+        time_limit_s: float | None = None,
     ) -> Equilibrium:
         """Find the stable equilibrium to which slow heating and loading take the arm from `start`, or from the unloaded arm.
 
@@ -420,8 +205,9 @@ class Arm:
             An earlier equilibrium of this arm: a warm start.
         payload : Payload, optional
             What hangs from the tip instead of the arm's own payload.
-        time_limit_s : float
-            A solve that takes longer is given up [s]; the compiling of the kernels at the very first one does not count.
+        time_limit_s : float, optional
+            A solve that takes longer is given up [s]; compiling the kernels at the very first one does not count. Without a
+            limit counted iterations bound the work, so that the same bits come out however busy the machine is.
 
         Returns
         -------
@@ -438,83 +224,33 @@ class Arm:
         -----
         Gauss collocation of the strain, by a ladder: Newton straight from the start, its first step the tangent's prediction;
         then substeps in drive and load; then those on a finer grid; then, where the branch ends, the fall down the hill of the
-        total energy, and on from there. See `kernels.newton`, `kernels.follow` and `ladder`.
+        total energy, and on from there. See `solver.newton` and `continuation`.
         """
         drive = self.checked_drive(drive)
         load = self.load(tip_force, tip_moment, payload)
-        if time_limit_s is not TIME_LIMIT_S:
+        if time_limit_s is not None:
             time_limit_s = check.scalar("time_limit_s", time_limit_s, 0.0, above=True)
         lane = self.unloaded() if start is None else self.restart(start)
-        tip, lengths, report = EYE.copy(), np.empty((1, drive.size)), np.empty((1, REPORT))
-        asked = (drive[np.newaxis], load[np.newaxis])
-        on, message = self, ""
-        if not (self.unstressed(load) and self._closed_form(lane, *asked, tip, lengths, report)):
-            compile_kernels()
-            begun = time.perf_counter()
-            strain, tension, from_drive, from_load = lane
-            solve_lanes(
-                self.model, strain[np.newaxis], tension[np.newaxis], from_drive[np.newaxis], from_load[np.newaxis], *asked,
-                tip, lengths, report,
-            )  # fmt: skip
-            if report[0, 0] == FAILED:
-                here = self.unloaded() if start is None else self.restart(start)
-                climbed = ladder.climb(self, here, lane, drive, load, report[0, 3], begun, time_limit_s)
-                message, on, lane = climbed.message, climbed.arm, climbed.lane
-                tip[0], lengths[0], iterations = climbed.tip, climbed.lengths, report[0, 2] + climbed.iterations
-                report[0, :4] = climbed.rung, climbed.residual, iterations, climbed.jumped
-            elif report[0, 0] == SUBSTEPS or report[0, 4] > ladder.DOUBT:
-                here = self.unloaded() if start is None else self.restart(start)
-                report[0, 3] = not ladder.returns(self.model, lane, here, begun + time_limit_s)
-        rung, residual, iterations, jumped, _ = report[0].tolist()
-        if rung == FAILED:
-            on, lane = self, here
-            ends, _, position, _, _, lengths[0] = on.shape(lane)
-            tip[0] = pose(ends[-1], position[-1])
-            message = f"no equilibrium found: Newton does not go straight to one; {message}; this is the start's shape"
-        elif rung == CLOSED_FORM:
-            message = "closed form: nothing loads the arm"
-        elif rung == WARM:
+        found = continuation.solve_one(self, lane, drive, load, time_limit_s)
+        on, lane, rung = found.arm, found.lane, found.rung
+        if rung == Rung.FAILED:
+            message = f"no equilibrium found: Newton does not go straight to one; {found.message}; this is the start's shape"
+        elif rung == Rung.WARM:
             message = self._found
         else:
-            message = "; ".join([f"{self._found} by {RUNGS[rung]}", *filter(None, [message])])
+            message = "; ".join([f"{self._found} by {HOW[rung]}", *filter(None, [found.message])])
         state = _Shape(on, lane)
         return Equilibrium(
-            tip_pose=tip[0],
-            tensions=lane.tension,
-            muscle_lengths=lengths[0],
-            drive=drive,
-            converged=rung != FAILED,
-            rung=LADDER[int(rung)],
-            jumped=bool(jumped),
-            residual=residual,
-            iterations=int(iterations),
-            message=message,
-            length=self.length,
-            load=load,
-            known=(lane.drive, lane.load),
-            sample=state.sample,
-            differentiate=state.differentiate,
-            certify=state.certify,
-            nodes=(on.model, lane.strain),
-        )
+            tip_pose=found.tip, tensions=lane.tension, muscle_lengths=found.lengths, drive=drive, converged=rung != Rung.FAILED,
+            rung=rung, jumped=found.jumped, residual=found.residual, iterations=found.iterations, message=message,
+            length=self.length, load=load, known=(lane.drive, lane.load), sample=state.sample, certify=state.certify,
+            differentiate=state.differentiate, nodes=(on.model, lane.strain),
+        )  # fmt: skip
 
-    def _closed_form(self, lane: Lane, drive: Array, load: Array, tip: Array, lengths: Array, report: Array) -> bool:
-        """Solve in closed form, in place; False where that is no answer, or where the lane is left as it was."""
-        strain, tension, at_drive, at_load = (values.copy() for values in lane)
-        known = (strain[np.newaxis], tension[np.newaxis], at_drive[np.newaxis], at_load[np.newaxis])
-        if not closed_form.solve_lane(self.model, self.sections, *known, drive, load, tip, lengths, report):
-            return False
-        # Where nothing pushes the energy is convex; but a muscle may, and a coarse grid may not hold the shape.
-        if ladder.negative_eigenvalues(self.model, strain, tension, at_drive, at_load, kernels.NEUTRAL):
-            return False
-        for values, new in zip(lane, (strain, tension, at_drive, at_load), strict=True):
-            values[...] = new
-        return True
-
-    def shape(self, lane: Lane) -> tuple[Array, ...]:
-        """Return quaternions at elements' ends and nodes, positions at ends [m], p' and p' x n at nodes, path lengths [m]."""
-        strain, tension, drive, load = lane
-        return linearise(self.model, strain, tension.copy(), drive, load, 0.0, False, SHAPE, strain)[1:7]
+    def tip_of(self, lane: Lane) -> tuple[Array, Array]:
+        """Return the tip pose (4, 4) [m] and the muscles' path lengths (n,) [m] of a state."""
+        shape = linearise(self.problem, *lane, "shape")
+        return pose(shape.h_end[-1], shape.p_end[-1]), shape.path
 
     def pieces(self, s: Array) -> Iterator[Piece]:
         """Yield the elements, base to tip, with those of the arc positions `s` (k,) [m] that they hold."""
@@ -531,14 +267,14 @@ class Arm:
 
     def poses(self, lane: Lane, s: Array) -> Array:
         """Return the poses (k, 4, 4) of the cross sections of an equilibrium at arc positions `s` (k,) in [0, length] [m]."""
-        ends, quaternion, position, tangent, _, _ = self.shape(lane)
+        shape = linearise(self.problem, *lane, "shape")
         turns, places = np.empty((s.size, 4)), np.empty((s.size, 3))
         for e, piece in enumerate(self.pieces(s)):
             q = self.grids[piece.module].nodes
             nodes = slice(piece.node, piece.node + q)
             a = piece.length * integrals(gauss(q)[2], piece.fraction)
-            turns[piece.inside] = ends[e] + a @ _half_product(quaternion[nodes], lane.strain[nodes, :3])
-            places[piece.inside] = position[e] + a @ tangent[nodes]
+            turns[piece.inside] = shape.h_end[e] + a @ _half_product(shape.h[nodes], lane.strain[nodes, :3])
+            places[piece.inside] = shape.p_end[e] + a @ shape.tangent[nodes]
         return pose(turns, places)
 
     def checked_drive(self, drive: ArrayLike) -> Array:
@@ -588,21 +324,21 @@ class _Shape(NamedTuple):
 
     def differentiate(self) -> Array:
         """Return d tip/d drive (6, n)."""
-        strain, tension, drive, load = self.lane
-        return linearise(self.arm.model, strain, tension.copy(), drive, load, 0.0, False, JACOBIAN, strain)[-1]
+        return linearise(self.arm.problem, *self.lane, "jacobian").tip
 
     def certify(self) -> float:
         """Return the smallest eigenvalue of the tangent."""
-        return ladder.smallest_eigenvalue(self.arm.model, *self.lane)
+        return continuation.smallest_eigenvalue(self.arm.problem, self.lane)
 
     def sample(self, s: Array) -> tuple[Array, Array]:
         """Return poses and strains at `s`: collocation polynomials for pose and moment, section balance for the strain."""
         arm, model = self.arm, self.arm.model
         strain, tension, _, load = self.lane
-        ends, _, position, _, spin, _ = arm.shape(self.lane)
-        rotation = pose(ends[-1], position[-1])[:3, :3]
-        force_tip = load[0:3] + load[9] * load[6:9]
-        moment = load[3:6] + np.cross(rotation @ load[10:13], load[9] * load[6:9])
+        shape = linearise(arm.problem, *self.lane, "shape")
+        spin, gravity = shape.spin, load[loads.GRAVITY]
+        rotation = pose(shape.h_end[-1], shape.p_end[-1])[:3, :3]
+        weight = load[loads.MASS] * gravity
+        force_tip, moment = load[loads.FORCE] + weight, load[loads.MOMENT] + np.cross(rotation @ load[loads.CENTRE], weight)
         poses, strains = arm.poses(self.lane, s), np.empty((s.size, 6))
         mass = 0.0
         for piece in reversed(list(arm.pieces(s))):
@@ -614,23 +350,12 @@ class _Shape(NamedTuple):
             for index, a, here in zip(piece.inside, coefficients, piece.fraction, strict=True):
                 r = poses[index, :3, :3]
                 below = mass + module.mass_per_length * piece.length * (1.0 - here)
-                wrench = np.concatenate(
-                    [
-                        r.T @ (moment + (piece.length * b - a) @ spin[nodes]),
-                        r.T @ (force_tip + below * load[6:9]),
-                    ]
-                )
+                moments, forces = moment + (piece.length * b - a) @ spin[nodes], force_tip + below * gravity
                 fraction = (piece.number + here) / arm.grids[piece.module].elements
-                route = np.array([module.route(m, fraction) for m in module.muscles]).reshape(-1, 4)
+                route = np.array([m.route(module.length, fraction) for m in module.muscles]).reshape(-1, 4)
                 nearest = strain[piece.node + int(np.argmin(np.abs(c - here)))]
-                strains[index] = section.solve(
-                    module.stiffness,
-                    module.reference_strain,
-                    route,
-                    tension[muscles],
-                    wrench,
-                    nearest,
-                )
+                wrench, properties = np.concatenate([r.T @ moments, r.T @ forces]), (module.stiffness, module.reference_strain)
+                strains[index] = section.solve(*properties, route, tension[muscles], wrench, nearest)
             moment = moment + piece.length * b @ spin[nodes]
             mass += module.mass_per_length * piece.length
         return poses, strains
@@ -640,21 +365,12 @@ def pose(quaternion: Array, position: Array) -> Array:
     """Return the (..., 4, 4) poses of quaternions (..., 4), w x y z, of any norm, and positions (..., 3)."""
     w, x, y, z = np.moveaxis(quaternion, -1, 0) / np.sqrt(np.sum(quaternion**2, axis=-1))
     result = np.zeros((*np.shape(w), 4, 4))
-    result[..., 0, 0], result[..., 0, 1], result[..., 0, 2] = (
-        1.0 - 2.0 * (y * y + z * z),
-        2.0 * (x * y - w * z),
-        2.0 * (x * z + w * y),
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
-    result[..., 1, 0], result[..., 1, 1], result[..., 1, 2] = (
-        2.0 * (x * y + w * z),
-        1.0 - 2.0 * (x * x + z * z),
-        2.0 * (y * z - w * x),
-    )
-    result[..., 2, 0], result[..., 2, 1], result[..., 2, 2] = (
-        2.0 * (x * z - w * y),
-        2.0 * (y * z + w * x),
-        1.0 - 2.0 * (x * x + y * y),
-    )
+    result[..., :3, :3] = np.moveaxis(np.array(rows), (0, 1), (-2, -1))
     result[..., :3, 3], result[..., 3, 3] = position, 1.0
     return result
 
@@ -683,32 +399,13 @@ def _checked(grids: Sequence[Grid], modules: int) -> tuple[Grid, ...]:
     return result
 
 
-def _sections(modules: tuple[Module, ...], grids: tuple[Grid, ...], node_arc: Array) -> closed_form.Sections | None:
-    """Return the modules' sections for `closed_form`, or None where a module's strain is not uniform without load.
-
-    It is where all muscles run straight, and also where all turn at the same rate around a rod that looks alike from all sides.
-    """
-    turn = np.zeros(len(modules))
-    for k, module in enumerate(modules):
-        turns = {muscle.turns for muscle in module.muscles if muscle.offset > 0.0}
-        axial = not module.reference_strain[[0, 1, 3, 4]].any()
-        alike = axial and module.stiffness[0] == module.stiffness[1] and module.stiffness[3] == module.stiffness[4]
-        if len(turns) > 1 or (any(turns) and not alike):
-            return None
-        turn[k] = 2.0 * np.pi * sum(turns) / module.length
-    route = np.array([module.route(muscle, 0.0) for module in modules for muscle in module.muscles]).reshape(-1, 4)
-    bases = np.cumsum([0.0, *(module.length for module in modules[:-1])])
-    arc = node_arc - np.repeat(bases, [grid.elements * grid.nodes for grid in grids])
-    return closed_form.Sections(route, turn, arc)
-
-
-def _compile(modules: tuple[Module, ...], grids: tuple[Grid, ...], tolerance: float) -> tuple[Model, Array]:
+def _model(modules: tuple[Module, ...], grids: tuple[Grid, ...], tolerance: float) -> tuple[Model, Array]:
     """Return the arm as plain arrays for the kernels, and the arc positions of its nodes (G,) [m]."""
     most_nodes = max(grid.nodes for grid in grids)
     most_muscles = max(len(module.muscles) for module in modules)
     a, b = np.zeros((len(modules), most_nodes, most_nodes)), np.zeros((len(modules), most_nodes))
     routes: list[Array] = []
-    mass_below: list[Array] = []
+    mass_beyond: list[Array] = []
     arc: list[Array] = []
     base = 0.0
     for k, (module, (elements, q)) in enumerate(zip(modules, grids, strict=True)):
@@ -717,27 +414,22 @@ def _compile(modules: tuple[Module, ...], grids: tuple[Grid, ...], tolerance: fl
         x = ((np.arange(elements)[:, np.newaxis] + c) / elements).ravel()
         route = np.zeros((len(x), most_muscles, 4))
         for i, muscle in enumerate(module.muscles):
-            route[:, i] = module.route(muscle, x)
+            route[:, i] = muscle.route(module.length, x)
         routes.append(route)
-        mass_below.append(beyond + module.mass_per_length * module.length * (1.0 - x))
+        mass_beyond.append(beyond + module.mass_per_length * module.length * (1.0 - x))
         arc.append(base + module.length * x)
         base += module.length
     muscles = [(module, muscle) for module in modules for muscle in module.muscles]
-    fields: dict[str, Any] = dict(
+    model = Model(
         elements=np.array([grid.elements for grid in grids], dtype=np.int64),
         nodes=np.array([grid.nodes for grid in grids], dtype=np.int64),
-        length=np.array([module.length for module in modules]),
-        a=a,
-        b=b,
+        length=np.array([module.length for module in modules]), a=a, b=b,
         stiffness=np.array([module.stiffness for module in modules]),
         reference=np.array([module.reference_strain for module in modules]),
         first_muscle=np.cumsum([0] + [len(module.muscles) for module in modules]).astype(np.int64),
-        route=np.concatenate(routes),
-        mass_below=np.concatenate(mass_below),
+        route=np.concatenate(routes), mass_beyond=np.concatenate(mass_beyond),
         kind=np.array([muscle.law.kind for _, muscle in muscles], dtype=np.int64),
         parameters=np.array([muscle.law.parameters() for _, muscle in muscles]).reshape(-1, PARAMETERS),
-        rest_length=np.array([module.rest_length(muscle) for module, muscle in muscles]),
-        tolerance=tolerance,
-    )
-    f, i = flat(**fields)
-    return Model(**fields, ladder=True, f=f, i=i), np.concatenate(arc)
+        rest_length=np.array([module.rest_length(muscle) for module, muscle in muscles]), tolerance=tolerance,
+    )  # fmt: skip
+    return model, np.concatenate(arc)

@@ -12,18 +12,21 @@ Everything is deterministic: costs are counted, not timed.
 """
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from math import ceil
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tca_envs.mechanics import check, ladder
-from tca_envs.mechanics.arm import MAX_NODES, Arm, Grid, Module, carried
-from tca_envs.mechanics.collocation import solve_lanes
-from tca_envs.mechanics.kernels import FAILED, LOAD, REPORT
+from tca_envs.mechanics import check, continuation, solver
+from tca_envs.mechanics.arm import Arm
+from tca_envs.mechanics.grid import MAX_NODES, Grid, carried
+from tca_envs.mechanics.loads import SIZE
+from tca_envs.mechanics.module import Module
+from tca_envs.mechanics.rungs import Rung
+from tca_envs.mechanics.solver import Lanes
 
 Array = NDArray[np.float64]
 
@@ -48,25 +51,17 @@ class Known(NamedTuple):
     """Solved states of an arm, S of them."""
 
     arm: Arm
-    drive: Array
-    """(S, n)."""
-    load: Array
-    """(S, LOAD)."""
-    strain: Array
-    """(S, G, 6)."""
-    tension: Array
-    """(S, n)."""
-    tip: Array
-    """(S, 3) [m]."""
-    found: NDArray[np.bool_]
-    """(S,) whether there is an equilibrium; the rest of such a row says nothing."""
+    drive: Array  # (S, n)
+    load: Array  # (S, loads.SIZE)
+    strain: Array  # (S, G, 6)
+    tension: Array  # (S, n)
+    tip: Array  # (S, 3) [m]
+    found: NDArray[np.bool_]  # (S,) whether there is an equilibrium; the rest of such a row says nothing
 
     def some(self, states: NDArray[np.intp] | NDArray[np.bool_] | slice) -> "Known":
         """Return some of the states."""
-        return Known(
-            self.arm, self.drive[states], self.load[states], self.strain[states], self.tension[states], self.tip[states],
-            self.found[states],
-        )  # fmt: skip
+        rows: list[Any] = [values[states] for values in self[1:]]
+        return Known(self.arm, *rows)
 
 
 def discretise(arm: Arm, tolerance: float, drives: ArrayLike, loads: ArrayLike | None = None) -> Arm:
@@ -80,7 +75,7 @@ def discretise(arm: Arm, tolerance: float, drives: ArrayLike, loads: ArrayLike |
         Largest tip error [m], in [1e-9, 1e-3].
     drives : (S, n) array
         The scene: states that it will meet, typical and extreme ones.
-    loads : (S, LOAD) array, optional
+    loads : (S, SIZE) array, optional
         Load of each state as of `Arm.load`; by default the arm's own weight and payload.
 
     Returns
@@ -96,12 +91,10 @@ def discretise(arm: Arm, tolerance: float, drives: ArrayLike, loads: ArrayLike |
     """
     tolerance = check.scalar("tolerance", tolerance, FINEST, COARSEST)
     drive = check.array("drives", drives, (None, len(arm.muscles)))
-    load = np.tile(arm.load(), (len(drive), 1)) if loads is None else check.array("loads", loads, (len(drive), LOAD))
+    load = np.tile(arm.load(), (len(drive), 1)) if loads is None else check.array("loads", loads, (len(drive), SIZE))
     for row in drive:
         arm.checked_drive(row)
     residual_tolerance = NEWTON_SHARE * tolerance / arm.length
-    if len(drive) and all(arm.unstressed(row) for row in load):
-        return _chosen(arm, arm.grids, residual_tolerance, tolerance, 0.0, len(drive))
     known = _hardest(arm, drive, load)
     if not len(known.drive):
         raise ValueError(f"drives = {drives!r}: expected states of which at least one has an equilibrium")
@@ -144,9 +137,11 @@ def _hardest(arm: Arm, drive: Array, load: Array) -> Known:
     coarse, middling = [Grid(e, 5 if e == 1 else 4) for e in elements], [Grid(e, 7 if e == 1 else 6) for e in elements]
     rough = _on(arm, coarse, 1e-3)
     start = [np.tile(x, (len(drive), *[1] * x.ndim)) for x in rough.unloaded()]
-    first = _solve(rough, _in_substeps, drive, load, *(x.copy() for x in start))
+    lanes = _lanes(*(x.copy() for x in start))
+    first = _known(rough, lanes, drive, load, solver.solve(rough.problem, lanes, drive, load))
     beyond = ~first.found  # a branch's end, most of them
-    fallen = _solve(rough, ladder.solve, drive[beyond], load[beyond], *(x[beyond] for x in start))
+    lanes = _lanes(*(x[beyond] for x in start))
+    fallen = _known(rough, lanes, drive[beyond], load[beyond], continuation.solve(rough, lanes, drive[beyond], load[beyond]))
     for values, new in zip(first[1:], fallen[1:], strict=True):
         values[beyond] = new
     known = _carried(first.some(first.found), _on(arm, middling, 1e-6))
@@ -207,22 +202,14 @@ def _carried(known: Known, arm: Arm, off: float = 0.0) -> Known:
     strain = carried(known.arm.grids, known.strain, arm.grids)
     if off:
         strain -= off * (strain - arm.unloaded()[0])
-    start = (strain, known.tension.copy(), known.drive.copy(), known.load.copy())
-    return _solve(arm, _straight, known.drive, known.load, *start)
+    lanes = _lanes(strain, known.tension.copy(), known.drive.copy(), known.load.copy())
+    report = solver.solve(arm.problem, lanes, known.drive, known.load, substeps=False)
+    return _known(arm, lanes, known.drive, known.load, report)
 
 
-def _in_substeps(arm: Arm, *lanes: Array) -> None:
-    solve_lanes(arm.model, *lanes)
+def _lanes(strain: Array, tension: Array, drive: Array, load: Array) -> Lanes:
+    return Lanes(strain, tension, drive, load, np.tile(np.eye(4), (len(drive), 1, 1)), np.empty_like(drive))
 
 
-def _straight(arm: Arm, *lanes: Array) -> None:
-    solve_lanes(arm.model._replace(ladder=False), *lanes)
-
-
-def _solve(
-    arm: Arm, solver: Callable[..., None], drive: Array, load: Array, strain: Array, tension: Array, from_drive: Array,
-    from_load: Array,
-) -> Known:  # fmt: skip
-    tip, lengths, report = np.tile(np.eye(4), (len(drive), 1, 1)), np.empty_like(drive), np.empty((len(drive), REPORT))
-    solver(arm, strain, tension, from_drive, from_load, drive, load, tip, lengths, report)
-    return Known(arm, drive, load, strain, tension, tip[:, :3, 3], report[:, 0] != FAILED)
+def _known(arm: Arm, lanes: Lanes, drive: Array, load: Array, report: Any) -> Known:
+    return Known(arm, drive, load, lanes.strain, lanes.tension, lanes.tip[:, :3, 3], report["rung"] != Rung.FAILED)

@@ -2,38 +2,21 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tca_envs.mechanics import check, kernels
-from tca_envs.mechanics.collocation import Model
+from tca_envs.mechanics import check
+from tca_envs.mechanics.rungs import NEUTRAL, Rung
+from tca_envs.mechanics.solver import Model
 
 Array = NDArray[np.float64]
 
 
-class Rung(IntEnum):
-    """Which rung of the ladder answered; each is tried where the one before fails."""
-
-    WARM = kernels.WARM
-    """Newton straight from the start."""
-    SUBSTEPS = kernels.SUBSTEPS
-    """Newton in substeps of drive and load."""
-    FINER = kernels.FINER
-    """The same on a grid of twice the elements."""
-    DESCENT = kernels.DESCENT
-    """The start's branch ends: a fall down the hill of the total energy, and on from there."""
-    FAILED = kernels.FAILED
-    """None."""
-    CLOSED_FORM = kernels.CLOSED_FORM
-    """Nothing loads the arm."""
-
-
 @dataclass(frozen=True, eq=False)
 class Equilibrium:
-    """An equilibrium of an arm, as `Arm.equilibrium` and `shooting.equilibrium` return it.
+    """An equilibrium of an arm, as `Arm.equilibrium` returns it.
 
     Attributes
     ----------
@@ -48,16 +31,16 @@ class Equilibrium:
     converged : bool
         Whether this is an equilibrium at the asked drive and load. Otherwise the shape is that of the start.
     rung : Rung
-        Which rung of the ladder answered. `shooting` knows none: WARM or FAILED.
+        Which rung of the ladder answered. The paper's shooting knows none: WARM or FAILED.
     jumped : bool
         Whether the start's branch of equilibria ends on the way to the asked drive and load, and the arm fell to another one
         and would not come back on the same way (a fold, a snap-through). Answers without a jump are on the start's branch.
     residual : float
         Dimensionless: the largest of |moment imbalance| L/EI (an angle over the module; GJ in torsion), |force
         imbalance|/GA (a strain; EA along the axis) and |muscle length mismatch|/rest length over all nodes and muscles.
-        `shooting` scales its own, see `shooting.residual`. Where nothing was found, that of the last try.
+        The paper's shooting scales its own. Where nothing was found, that of the last try.
     iterations : int
-        Newton iterations (evaluations of the residual for `shooting`).
+        Newton iterations (evaluations of the residual for shooting).
     message : str
         What happened: why the rungs before the one that answered did not.
     """
@@ -118,7 +101,7 @@ class Equilibrium:
     @property
     def stable(self) -> bool:
         """Whether this equilibrium is stable: `stability` > 0; or 0 within 1e-5, as where an arm can turn without any work."""
-        return self.stability > -kernels.NEUTRAL
+        return self.stability > -NEUTRAL
 
     def _arc(self, s: ArrayLike) -> Array:
         positions = check.array("s", [s] if isinstance(s, int | float) else s, (None,))

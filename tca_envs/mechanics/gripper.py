@@ -13,35 +13,34 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tca_envs.mechanics import check
-from tca_envs.mechanics.algebra import entry
-from tca_envs.mechanics.arm import Arm, Module
-from tca_envs.mechanics.muscle import TCA, Muscle, law
-from tca_envs.mechanics.packs import pointer_to_floats
-from tca_envs.mechanics.traced import size
+from tca_envs.mechanics.arm import Arm
+from tca_envs.mechanics.laws import TCA, coil
+from tca_envs.mechanics.module import Module
+from tca_envs.mechanics.muscle import Muscle
+from tca_envs.mechanics.solver import compiled
 
 Array = NDArray[np.float64]
 
 ITERATIONS = 50
 
 
-@entry
-def ring_tension(kind, parameters, length, rest_length, compliance, temperature, tension):
+@compiled
+def ring_tension(law, length, rest_length, compliance, temperature, tension):
     """Write the tension of the ring's muscle [N] at each temperature.
 
     Without load the strain is uniform, K (xi - xi*) = -F [r x t; t], and the path changes by -F length compliance with
     compliance = 1/EA + r^2/EI. So elongation(F, T) + F length compliance = 0, which rises with F and bends down: Newton from
     F = 0 comes from the left and cannot overshoot. For F < 0 (slack) the law is linear and one step is exact.
     """
-    f, given, found = pointer_to_floats(parameters), pointer_to_floats(temperature), pointer_to_floats(tension)
     for i in range(tension.size):
         force = 0.0
         for _ in range(ITERATIONS):
-            delta, softness, _ = law(kind, f, 0, rest_length, force, given[i])
+            delta, softness, _ = coil(law, 0, rest_length, force, temperature[i])
             step = (delta + force * length * compliance) / (softness + length * compliance)
             force -= step
-            if size(step) < 1e-14:
+            if abs(step) < 1e-14:
                 break
-        found[i] = force
+        tension[i] = force
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,7 @@ class Gripper:
         given = self._checked(temperature)
         result = np.empty(given.size)
         compliance = 1.0 / self.axial_stiffness + self.offset**2 / self.bending_stiffness
-        ring_tension(self.law.kind, self.law.parameters(), self.length, self.rest_length, compliance, given.ravel(), result)
+        ring_tension(self.law.parameters()[np.newaxis], self.length, self.rest_length, compliance, given.ravel(), result)
         return result.reshape(given.shape)
 
     def gap(self, temperature: ArrayLike) -> Array:

@@ -4,13 +4,13 @@ All functions work elementwise on arrays of any shape; the last axis is the musc
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tca_envs.mechanics import check
-from tca_envs.mechanics.muscle import REFERENCE_LENGTH
+from tca_envs.mechanics.laws import REFERENCE_LENGTH
 
 Array = NDArray[np.float64]
 
@@ -22,17 +22,26 @@ HARD_LIMIT = 160.0
 """Temperature that is never reached [degC]."""
 
 
+KEPT, LOST, LOSS, MAX_POWER, AIR, LIMIT = range(6)
+"""Rows of `constants`."""
+
+
+class Heat(NamedTuple):
+    """How drives come about that are temperatures of heated TCAs: by one step of `heated`."""
+
+    action: Array  # (N, m) heating powers asked for, -1 (none) to 1 (full)
+    temperature: Array  # (N, m) at the start of the step [degC]
+    power: Array  # (N, m) out: heating powers [W]
+    constants: Array  # (6, m), see `constants`
+
+
 class Heating(NamedTuple):
     """Thermal constants of n muscles."""
 
-    capacity: Array
-    """C (n,) [J/K]."""
-    loss: Array
-    """lambda (n,) [W/K]."""
-    max_power: Array
-    """(n,) [W]."""
-    ambient: float = AMBIENT
-    """T_amb [degC]."""
+    capacity: Array  # C (n,) [J/K]
+    loss: Array  # lambda (n,) [W/K]
+    max_power: Array  # (n,) [W]
+    ambient: float = AMBIENT  # T_amb [degC]
 
     def part(self, muscles: slice) -> "Heating":
         """Return the constants of some of the muscles."""
@@ -109,7 +118,7 @@ def power_to_reach(temperature: ArrayLike, target: ArrayLike, duration: float, h
 
 
 def constants(duration: float, limit: float, heating: Heating) -> Array:
-    """Return the numbers (6, n) with which `kernels.heat` steps temperatures that never exceed `limit` [degC].
+    """Return the numbers (6, n) with which `heated` steps temperatures that never exceed `limit` [degC].
 
     Shares of heat kept and lost in a step of `duration` [s], loss [W/K], full power [W], ambient and limit [degC].
     """
@@ -117,6 +126,19 @@ def constants(duration: float, limit: float, heating: Heating) -> Array:
     return np.array(
         np.broadcast_arrays(np.exp(exponent), -np.expm1(exponent), heating.loss, heating.max_power, heating.ambient, limit)
     )
+
+
+def heated(constants: Any, k: int, temperature: float, action: float) -> tuple[float, float]:
+    """Return temperature [degC] after and power [W] in a step of TCA k: `step` at the power asked for, under the cut-off.
+
+    The same text for Python and for the compiled kernels; `action` goes from -1 (no power) to 1 (full).
+    """
+    kept, loss, ambient = constants[KEPT, k], constants[LOSS, k], constants[AIR, k]
+    asked = 0.5 * (min(max(-1.0, action), 1.0) + 1.0) * constants[MAX_POWER, k]
+    hottest = (constants[LIMIT, k] - kept * temperature) / constants[LOST, k]
+    power = min(asked, max(0.0, loss * (hottest - ambient)))
+    end = ambient + power / loss
+    return end + (temperature - end) * kept, power
 
 
 def time_to_reach(temperature: ArrayLike, target: ArrayLike, heating: Heating) -> Array:

@@ -4,23 +4,24 @@ A lane is one arm in one episode. Everything that it owns is a row of the arrays
 copy of the rows is a snapshot, and equal rows under equal actions stay equal.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs.mechanics import Arm, ladder, thermal
-from tca_envs.mechanics.collocation import Heat
-from tca_envs.mechanics.kernels import FAILED, LOAD, PAYLOAD_MASS, REPORT
-from tca_envs.mechanics.thermal import HARD_LIMIT, Heater
+from tca_envs.mechanics import Rung, continuation, loads, thermal
+from tca_envs.mechanics.continuation import Lanes
+from tca_envs.mechanics.thermal import Heat
+from tca_envs.robots import Robot
 
 Array = NDArray[np.float64]
+Solve = Callable[..., Any]
+"""What brings lanes to equilibrium: a function with the signature of `continuation.solve`."""
 
 STEP_S = 0.1
-"""Duration of a step [s]."""
-CUT_OFF = HARD_LIMIT - 2.0
-"""Temperature [degC] that the heaters' firmware never lets a TCA exceed."""
+"""Default duration of a step [s]."""
 
 RAMP = (0.4, 0.7, 0.85, 0.99, 1.0)
 """Shares of the way in which `Core.settle` heats. The hotter, the more the arm bends: longer steps there take the solver
@@ -30,7 +31,7 @@ residual."""
 
 @dataclass
 class Record:
-    """N lanes of an arm with n muscles, and of m >= n heated TCAs: the arm's come first."""
+    """N lanes of a robot whose arm has n muscles, and of m >= n heated TCAs: the arm's come first."""
 
     temperature: Array
     """(N, m) [degC]."""
@@ -47,7 +48,7 @@ class Record:
     drive: Array
     """(N, n) temperatures at which strain and tension are in equilibrium [degC]."""
     load: Array
-    """(N, LOAD) load at which they are."""
+    """(N, loads.SIZE) load at which they are."""
     payload: Array
     """(N, 4) what hangs from the tip: mass [kg] and its centre in the tip's frame [m]."""
     tip: Array
@@ -73,42 +74,53 @@ class Record:
             getattr(self, f.name)[lanes] = getattr(source, f.name)
 
 
-def solved(report: Array) -> NDArray[np.bool_]:
-    """Return which lanes of a report (..., REPORT) of `Core.step` have an equilibrium."""
-    return np.asarray(report[..., 0] != FAILED)
+def solved(report: Any) -> NDArray[np.bool_]:
+    """Return which lanes of a report (...,) of `Core.step` have an equilibrium."""
+    return np.asarray(report["rung"] != Rung.FAILED)
 
 
 class Core:
-    """N lanes of one arm.
+    """N lanes of one robot.
 
     Parameters
     ----------
-    arm : Arm
-        Its muscles are TCAs.
-    heater : Heater
-        Thermal constants of a 45 mm TCA.
+    robot : Robot
+        What is heated.
+    tolerance : float
+        Largest error of the arm's tip [m].
     lanes : int
         N.
     goal_size, scene_size : int
         Numbers in the task's goal and scene.
-    others : sequence of float
-        Rest lengths of heated TCAs that are not the arm's [m].
+    step_s : float
+        Duration of a step [s].
+    solve : function
+        Brings lanes to equilibrium.
     """
 
     def __init__(
-        self, arm: Arm, heater: Heater, lanes: int, goal_size: int, scene_size: int = 0, others: Sequence[float] = ()
+        self,
+        robot: Robot,
+        tolerance: float,
+        lanes: int,
+        goal_size: int,
+        scene_size: int = 0,
+        step_s: float = STEP_S,
+        solve: Solve = continuation.solve,
     ) -> None:
-        self.arm = arm
+        self.arm = robot.built(tolerance)
         self.threads = 1  # that share the lanes
-        self.heating = heater.scaled(np.append(arm.rest_lengths, others))
-        self._heating = thermal.constants(STEP_S, CUT_OFF, self.heating)
-        self.load = arm.load()
-        """Gravity, and forces on the tips if any, as `kernels.LOAD` numbers, of steps; may be changed between them."""
+        self.step_s = step_s
+        self.solve = solve
+        self.heating = robot.heating()
+        self._heating = thermal.constants(step_s, robot.limits.cut_off, self.heating)
+        self.load = self.arm.load()
+        """Gravity, and forces on the tips if any, see `loads`, of steps; may be changed between them."""
         self.rest, self.rest_report = self._rest(goal_size, scene_size)
         self.record = self.rest.rows(np.zeros(lanes, dtype=np.intp))
 
-    def _rest(self, goal_size: int, scene_size: int) -> tuple[Record, Array]:
-        """Return the one-lane record of the arm at ambient temperature, where episodes start, and its report (1, REPORT)."""
+    def _rest(self, goal_size: int, scene_size: int) -> tuple[Record, Any]:
+        """Return the one-lane record of the arm at ambient temperature, where episodes start, and its report (1,)."""
         ambient = np.full((1, self.heating.loss.size), self.heating.ambient)
         strain, tension, drive, load = (values[np.newaxis] for values in self.arm.unloaded())
         record = Record(
@@ -120,7 +132,7 @@ class Core:
             tension=tension,
             drive=drive,
             load=load,
-            payload=self.arm.load()[np.newaxis, PAYLOAD_MASS:],
+            payload=self.arm.load()[np.newaxis, loads.PAYLOAD],
             tip=np.eye(4)[np.newaxis].copy(),
             length=np.zeros_like(tension),
             goal=np.zeros((1, goal_size)),
@@ -131,25 +143,22 @@ class Core:
             raise RuntimeError(f"the arm has no equilibrium at {self.heating.ambient:g} degC to start from")
         return record, report
 
-    def _solve(self, record: Record, temperature: Array, external: Array, heat: Heat | None = None) -> Array:
-        """Bring lanes to equilibrium at `temperature` (N, m), or at what `heat` makes of it; returns the report (N, REPORT).
+    def _solve(self, record: Record, temperature: Array, external: Array, heat: Heat | None = None) -> Any:
+        """Bring lanes to equilibrium at `temperature` (N, m), or at what `heat` makes of it; returns the report (N,).
 
-        Where there is none, they stay as they are. `external` (LOAD,) is their load but for their payloads.
+        Where there is none, they stay as they are. `external` (loads.SIZE,) is their load but for their payloads.
         """
-        report = np.empty((len(temperature), REPORT))
-        load = np.empty((len(temperature), LOAD))
+        load = np.empty((len(temperature), loads.SIZE))
         load[:] = external
-        load[:, PAYLOAD_MASS:] = record.payload
-        ladder.solve(
-            self.arm, record.strain, record.tension, record.drive, record.load, temperature, load,
-            record.tip, record.length, report, self.threads, heat,
-        )  # fmt: skip
+        load[:, loads.PAYLOAD] = record.payload
+        lanes = Lanes(record.strain, record.tension, record.drive, record.load, record.tip, record.length)
+        report = self.solve(self.arm, lanes, temperature, load, self.threads, heat)
         good = solved(report)
         rows = slice(None) if good.all() else good
         record.temperature[rows] = temperature[rows]
         if heat is not None:
             record.power[rows] = heat.power[rows]
-            record.energy[rows] += STEP_S * np.add.reduce(heat.power[rows], axis=1)
+            record.energy[rows] += self.step_s * np.add.reduce(heat.power[rows], axis=1)
         return report
 
     def reset(self, lanes: NDArray[np.intp], goals: Array | float, scenes: Array | float) -> None:
@@ -158,7 +167,7 @@ class Core:
         self.record.goal[lanes] = goals
         self.record.scene[lanes] = scenes
 
-    def step(self, action: Array) -> Array:
+    def step(self, action: Array) -> Any:
         """Heat for one step and find the equilibrium.
 
         Parameters
@@ -168,7 +177,7 @@ class Core:
 
         Returns
         -------
-        (N, REPORT) array
+        (N,) structured array
             Rung, residual, iterations and jumped of the solver, see `Equilibrium`. A lane without equilibrium stays as it was.
         """
         record = self.record
@@ -204,5 +213,5 @@ class Core:
             record.payload[:] = payload
         for done in RAMP:
             report = self._solve(record, self.heating.ambient + done * (target - self.heating.ambient), self.arm.load())
-            good &= solved(report) & (report[:, 3] == 0.0)
+            good &= solved(report) & (~report["jumped"])
         return record, good

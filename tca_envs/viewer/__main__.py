@@ -6,6 +6,8 @@ import sys
 import threading
 import warnings
 
+from tca_envs import registry
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Serve the page until interrupted; returns the exit status."""
@@ -16,6 +18,11 @@ def main(arguments: list[str] | None = None) -> int:
         "--host", default="127.0.0.1", help="address to bind to; by default this machine alone can see the page (%(default)s)"
     )
     parser.add_argument("--port", type=int, default=8080, help="port to bind to, 0 for any free one (%(default)s)")
+    parser.add_argument(
+        "--task",
+        default="reach",
+        help="what to begin with; module:name is a task that importing the module registers (%(default)s)",
+    )
     options = parser.parse_args(arguments)
     if not 0 <= options.port <= 65535:
         parser.error(f"--port {options.port}: expected a number from 0 to 65535")
@@ -31,9 +38,13 @@ def main(arguments: list[str] | None = None) -> int:
         from tca_envs.viewer.server import Viewer
     except ImportError as error:
         parser.error(str(error))
+    try:
+        registry.entry(options.task)
+    except (ValueError, ImportError) as error:
+        parser.error(f"--task {options.task}: {error}")
     # A visitor who leaves while the arm is drawn is no reason to worry anyone.
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
-    viewer = Viewer(options.host, options.port)
+    viewer = Viewer(options.host, options.port, options.task)
     try:
         threading.Event().wait()
     except KeyboardInterrupt:

@@ -15,21 +15,31 @@ try:
 except ModuleNotFoundError as error:
     raise ImportError('the viewer needs viser: pip install "tca_envs[viewer]"') from error
 
+from tca_envs import registry
 from tca_envs.geometry import HEAT, Part, heat_colour
 from tca_envs.mechanics import Rung
 from tca_envs.mechanics.thermal import AMBIENT, HARD_LIMIT
-from tca_envs.tasks.core import STEP_S
-from tca_envs.viewer.session import CONTROLLERS, MANUAL, MOST_GRAVITY, MOST_PAYLOAD, MOST_TILT, Session, World
+from tca_envs.robots.paper import TABLE
+from tca_envs.viewer.session import (
+    CONTROLLERS,
+    MANUAL,
+    MOST_GRAVITY,
+    MOST_PAYLOAD,
+    MOST_TILT,
+    Session,
+    World,
+    controllers,
+)  # fmt: skip
 
 Array = NDArray[np.float64]
 
 SCALE = 100.0
-"""The scene is drawn in cm: in metres the arm is smaller than what a browser's shadows and near plane are made for."""
+"""A scene over the paper's table is drawn in cm: in metres the arm is smaller than what a browser's shadows and near plane are
+made for. Others are scaled to it."""
 CAMERA, LOOK_AT, VIEW_RAD = (-9.0, 19.0, 1.0), (0.2, 0.0, 4.3), 0.52
 """Where the camera starts and what it looks at [cm], and its vertical field of view [rad]: the arm from top to table."""
-TASKS = {"Reach": "reach", "TwistAlign": "twist-align", "PickAndPlace": "pick-and-place"}
 TOLERANCES = {"1 mm": 1e-3, "0.1 mm": 1e-4, "10 µm": 1e-5, "1 µm": 1e-6, "10 nm": 1e-8}
-FIRST_TASK, FIRST_TOLERANCE = "Reach", "10 µm"
+FIRST_TOLERANCE = "10 µm"
 MOST_SEED = 2**31 - 1
 LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#6b6b6b")
 """Colours of the TCAs in the plots, which colour-blind readers can tell apart (Okabe and Ito, and a grey)."""
@@ -50,7 +60,6 @@ RUNGS = {
     Rung.FINER: "Newton on a finer grid",
     Rung.DESCENT: "fall down the energy",
     Rung.FAILED: "none found: stays as it was",
-    Rung.CLOSED_FORM: "closed form",
 }
 
 
@@ -61,16 +70,20 @@ class Page:
     ----------
     client : viser.ClientHandle
         The visitor's browser.
+    task : str
+        What it begins with.
     """
 
-    def __init__(self, client: viser.ClientHandle) -> None:
+    def __init__(self, client: viser.ClientHandle, task: str) -> None:
         self.client = client
-        self.session = Session(TASKS[FIRST_TASK], TOLERANCES[FIRST_TOLERANCE])
+        self.session = Session(task, TOLERANCES[FIRST_TOLERANCE])
+        self._titles = {entry.title: entry.name for entry in registry.entries()}
         self.running = True
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._left = threading.Event()
         self._meshes: dict[str, tuple[viser.MeshHandle, Part]] = {}
         self._plots: dict[str, list[viser.GuiUplotHandle]] = {}
+        self._sliders: dict[str, list[viser.GuiSliderHandle[float]]] = {}
         self._build()
 
     def leave(self) -> None:
@@ -87,7 +100,7 @@ class Page:
             except queue.Empty:
                 self._step()
                 # After a slow solve time goes on from there: nothing is caught up.
-                due = max(due + STEP_S, time.monotonic())
+                due = max(due + self.session.core.step_s, time.monotonic())
 
     def _build(self) -> None:
         gui = self.client.gui
@@ -95,7 +108,7 @@ class Page:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL)
         with gui.add_folder("Task"):
-            self._tasks = gui.add_button_group("Task", tuple(TASKS))
+            self._tasks = gui.add_button_group("Task", tuple(self._titles))
             self._tolerance = gui.add_dropdown(
                 "Tip error",
                 tuple(TOLERANCES),
@@ -106,16 +119,15 @@ class Page:
             self._reset = gui.add_button("Reset", icon=viser.Icon.REFRESH)
         with gui.add_folder("Time"):
             self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
-            self._single = gui.add_button("Step by 0.1 s", icon=viser.Icon.PLAYER_TRACK_NEXT, disabled=True)
-        with gui.add_folder("Drive"):
-            there = tuple(name for name, kind in CONTROLLERS.items() if not kind.missing())
-            self._controllers = gui.add_button_group("Driven by", there)
+            self._single = gui.add_button(
+                f"Step by {self.session.core.step_s:g} s", icon=viser.Icon.PLAYER_TRACK_NEXT, disabled=True
+            )
+        with gui.add_folder("Drive") as self._drive:
+            there = {name for entry in registry.entries() for name in controllers(entry.name)}
+            self._controllers = gui.add_button_group("Driven by", tuple(name for name in CONTROLLERS if name in there))
             for name, kind in CONTROLLERS.items():
-                if kind.missing():
-                    gui.add_markdown(f"*{name}: {kind.missing()}*")
-            # Those of the other tasks are the first ones of these.
-            controls = Session("pick-and-place").controls
-            self._sliders = [gui.add_slider(f"{c.label} [{c.unit}]", 0.0, round(c.most, 2), 0.01, 0.0) for c in controls]
+                if name not in there:
+                    gui.add_markdown(f"*{name}: {kind.missing(self.session.task)}*")
         with gui.add_folder("World"):
             self._gravity = gui.add_slider("Gravity [g]", -MOST_GRAVITY, MOST_GRAVITY, 0.05, 1.0, hint="Negative is upwards.")
             self._tilt = gui.add_slider("Tilt [°]", -MOST_TILT, MOST_TILT, 5.0, 0.0, hint="Of gravity, against the vertical.")
@@ -129,7 +141,7 @@ class Page:
         def when(event: Callable[[Callable[[Any], None]], Any], asked: Callable[[], None]) -> None:
             event(lambda _: self._asked.put(asked))
 
-        when(self._tasks.on_click, lambda: self._begin(TASKS[self._tasks.value]))
+        when(self._tasks.on_click, lambda: self._begin(self._titles[self._tasks.value]))
         when(self._tolerance.on_update, lambda: self._begin(self.session.task))
         when(self._reset.on_click, self._reset_episode)
         when(self._pause.on_click, self._pause_or_run)
@@ -141,8 +153,8 @@ class Page:
         """Start over with a task and the tolerance that is chosen."""
         controller = self.session.controller
         self.session = Session(task, TOLERANCES[self._tolerance.value], self._chosen_seed())
-        self._change_controller(controller)
         self._show_controls()
+        self._change_controller(controller)
 
     def _reset_episode(self) -> None:
         self.session.reset(self._chosen_seed())
@@ -158,16 +170,16 @@ class Page:
         self._single.disabled = self.running
 
     def _change_controller(self, controller: str) -> None:
-        self.session.drive_by(controller)
+        self.session.drive_by(controller if controller in controllers(self.session.task) else MANUAL)
         self._name()
-        for slider in self._sliders:
+        for slider in self._sliders.get(self.session.task, []):
             slider.disabled = self.session.controller != MANUAL
 
     def _step(self) -> None:
         session = self.session
         session.world = World(within(self._gravity), within(self._tilt), within(self._payload))
         if session.controller == MANUAL:
-            session.command[:] = [slider.value for slider in self._sliders[: len(session.controls)]]
+            session.command[:] = [slider.value for slider in self._sliders[session.task]]
         session.step()
         with self.client.atomic():
             self._draw()
@@ -179,22 +191,27 @@ class Page:
         # Nothing is removed: a browser that is behind would complain of what came last for it.
         session = self.session
         self._name()
-        for number, slider in enumerate(self._sliders):
-            slider.visible = number < len(session.controls)
-            slider.value = 0.0  # type: ignore[misc]  # viser has a setter
         if session.task not in self._plots:
             self._plots[session.task] = self._new_plots()
-        for task, plots in self._plots.items():
-            for plot in plots:
+            with self._drive:
+                self._sliders[session.task] = [
+                    self.client.gui.add_slider(f"{c.label} [{c.unit}]", 0.0, round(c.most, 2), 0.01, 0.0)
+                    for c in session.controls
+                ]
+        for task in self._plots:
+            for plot in self._plots[task]:
                 plot.visible = task == session.task
+            for slider in self._sliders[task]:
+                slider.visible = task == session.task
+        for slider in self._sliders[session.task]:
+            slider.value = 0.0  # type: ignore[misc]  # viser has a setter
         with self.client.atomic():
             self._draw()
             self._tell()
 
     def _name(self) -> None:
         """Say which task it is and what drives the arm."""
-        name = next(name for name, task in TASKS.items() if task == self.session.task)
-        self.client.gui.set_panel_label(f"{name}, {self.session.controller}")
+        self.client.gui.set_panel_label(f"{registry.entry(self.session.task).title}, {self.session.controller}")
 
     def _new_plots(self) -> list[viser.GuiUplotHandle]:
         """Return plots of temperatures and tensions of the session's TCAs."""
@@ -202,25 +219,28 @@ class Page:
         times, temperatures, tensions = self.session.history()
         with self._readings:
             return [
-                chart(self.client.gui, "temperature [°C]", names[: temperatures.shape[1]], HOT, times, temperatures),
-                chart(self.client.gui, "tension [mN]", names[: tensions.shape[1]], TIGHT, times, tensions),
+                chart(
+                    self.client.gui, label, names[: values.shape[1]], interval, series(times, values, self.session.core.step_s)
+                )
+                for label, interval, values in (("temperature [°C]", HOT, temperatures), ("tension [mN]", TIGHT, tensions))
             ]
 
     def _draw(self) -> None:
         """Show the arm as it is."""
         # A browser shows nothing where an opaque mesh gives way to a translucent one of the same name, as goals of tasks do.
         parts = {f"{self.session.task}/{name}": part for name, part in self.session.parts().items()}
+        scale = SCALE * (TABLE / self.session.env.task.ground)
         for name, part in parts.items():
             colour = rgb(part)
             if name not in self._meshes:
                 mesh = self.client.scene.add_mesh_simple(
-                    f"/{name}", SCALE * part.vertices, part.triangles, color=colour,
+                    f"/{name}", scale * part.vertices, part.triangles, color=colour,
                     opacity=None if part.opacity == 1.0 else part.opacity, cast_shadow=part.opacity == 1.0,
                 )  # fmt: skip
             else:
                 mesh, before = self._meshes[name]
                 if not np.array_equal(part.vertices, before.vertices):
-                    mesh.vertices = (SCALE * part.vertices).astype(np.float32)
+                    mesh.vertices = (scale * part.vertices).astype(np.float32)
                 if colour != rgb(before):
                     mesh.color = colour
             self._meshes[name] = mesh, part
@@ -232,10 +252,10 @@ class Page:
         session = self.session
         times, temperatures, tensions = session.history()
         for plot, values in zip(self._plots[session.task], (temperatures, tensions), strict=True):
-            plot.data = series(times, values)
+            plot.data = series(times, values, session.core.step_s)
         self._numbers.content = readings(session)
         if session.controller != MANUAL:
-            for slider, value in zip(self._sliders, session.command.tolist(), strict=False):
+            for slider, value in zip(self._sliders[session.task], session.command.tolist(), strict=True):
                 slider.value = min(round(value, 2), slider.max)  # type: ignore[misc]  # viser has a setter
 
 
@@ -245,12 +265,12 @@ def within(given: Any) -> float:
 
 
 def chart(
-    gui: viser.GuiApi, label: str, names: list[str], interval: tuple[float, float], times: Array, values: Array
+    gui: viser.GuiApi, label: str, names: list[str], interval: tuple[float, float], data: tuple[Array, ...]
 ) -> viser.GuiUplotHandle:
-    """Return a plot of values (k, c) over times (k,), a line for each name."""
-    lines = [uplot.Series(label=name, stroke=colour, width=2) for name, colour in zip(names, LINES, strict=False)]
+    """Return a plot of columns of data over the first one, a line for each name."""
+    lines = [uplot.Series(label=name, stroke=LINES[i % len(LINES)], width=2) for i, name in enumerate(names)]
     return gui.add_uplot(
-        series(times, values),
+        data,
         (uplot.Series(label="time [s]"), *lines),
         scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=interval)},
         axes=(
@@ -263,11 +283,11 @@ def chart(
     )
 
 
-def series(times: Array, values: Array) -> tuple[Array, ...]:
+def series(times: Array, values: Array, step_s: float) -> tuple[Array, ...]:
     """Return times and columns of values for a plot; what is to come of its shortest span is blank."""
-    missing = max(round(SHORTEST_S / STEP_S) + 1 - len(times), 0)
+    missing = max(round(SHORTEST_S / step_s) + 1 - len(times), 0)
     return (
-        np.concatenate([times, times[-1] + STEP_S * np.arange(1, missing + 1)]),
+        np.concatenate([times, times[-1] + step_s * np.arange(1, missing + 1)]),
         *(np.concatenate([column, np.full(missing, np.nan)]) for column in values.T),
     )
 
@@ -285,9 +305,10 @@ def readings(session: Session) -> str:
     """Return HTML with the task's and the solver's numbers, and the colours of temperatures."""
     info, solve, chosen = session.info, session.solve, session.env.arm.discretisation
     assert chosen.tolerance is not None and chosen.error is not None
-    task = {"time": f"{session.time:.1f} s", "distance": f"{info['distance_mm']:.2f} mm"}
-    if "yaw_error_deg" in info:
-        task["yaw error"] = f"{info['yaw_error_deg']:.1f}°"
+    task = {"time": f"{session.time:.1f} s"}
+    for name in [name for name in info if name not in ("is_success", "energy_J", "cost", "solver")]:
+        what, _, unit = name.rpartition("_")
+        task[what.replace("_", " ")] = f"{info[name]:.1f}°" if unit == "deg" else f"{info[name]:.2f} {unit}"
     task |= {"success": "yes" if info["is_success"] else "no", "energy": f"{info['energy_J']:.1f} J"}
     solver = {
         "step took": f"{solve.milliseconds:.2f} ms",

@@ -3,7 +3,8 @@
 import logging
 import threading
 
-from tca_envs.viewer.page import CAMERA, LOOK_AT, TASKS, VIEW_RAD, Page, viser
+from tca_envs import registry
+from tca_envs.viewer.page import CAMERA, LOOK_AT, VIEW_RAD, Page, viser
 from tca_envs.viewer.session import Session
 
 log = logging.getLogger(__name__)
@@ -25,9 +26,12 @@ class Viewer:
         Address to bind to.
     port : int
         0 for any free one; `url` tells which.
+    task : str
+        What pages begin with.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(self, host: str = "127.0.0.1", port: int = 8080, task: str = "reach") -> None:
+        self.task = registry.entry(task).name
         self.server = Server(host, port, verbose=False)
         self.server.scene.set_up_direction("-z")
         self.server.initial_camera.position, self.server.initial_camera.look_at = CAMERA, LOOK_AT
@@ -37,8 +41,8 @@ class Viewer:
         self.server.scene.configure_environment_map(None)
         self.server.scene.add_light_ambient("/all", intensity=1.3)
         self.server.scene.add_light_directional("/front", intensity=1.5, position=(6.0, 12.0, -4.0))
-        # The first step compiles kernels or reads them from a cache.
-        Session(TASKS["PickAndPlace"]).step()
+        for entry in registry.entries():  # the first step compiles kernels or reads them from a cache
+            Session(entry.name).step()
         self.pages: dict[int, Page] = {}
         """Of the visitors that are there, by viser's number of the client."""
         self.server.on_client_disconnect(self._leave)
@@ -60,7 +64,7 @@ class Viewer:
 
     def _serve(self, client: viser.ClientHandle) -> None:
         try:
-            page = self.pages[client.client_id] = Page(client)
+            page = self.pages[client.client_id] = Page(client, self.task)
             if client.client_id not in self.server.get_clients():
                 page.leave()  # gone while the page was made
             page.run()

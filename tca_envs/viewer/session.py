@@ -1,6 +1,5 @@
 """What one visitor plays with: an environment, what drives it, the world around it and its last half minute; no page."""
 
-import json
 import time
 from collections import deque
 from collections.abc import Callable
@@ -8,19 +7,18 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from math import cos, degrees, radians, sin
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tca_envs import presets
+from tca_envs import registry
 from tca_envs.env import ArmEnv
-from tca_envs.geometry import Part, parts
-from tca_envs.mechanics import Rung, check, grasp, ladder
+from tca_envs.geometry import Part
+from tca_envs.mechanics import Rung, check, continuation, loads
 from tca_envs.mechanics.discretisation import COARSEST, FINEST
-from tca_envs.mechanics.kernels import NEUTRAL
-from tca_envs.tasks.core import STEP_S
+from tca_envs.mechanics.rungs import NEUTRAL
+from tca_envs.robots import TOLERANCE
 
 Array = NDArray[np.float64]
 
@@ -106,7 +104,7 @@ class Session:
     Parameters
     ----------
     task : str
-        Name in `tca_envs.tasks.TASKS`.
+        Name of a task in `tca_envs.registry`, or "module:name".
     tolerance : float
         Largest error of the arm's tip [m], 1e-9 to 1e-3.
     seed : int
@@ -118,9 +116,9 @@ class Session:
         If an argument is none of these.
     """
 
-    def __init__(self, task: str = "reach", tolerance: float = presets.TOLERANCE, seed: int = 0) -> None:
+    def __init__(self, task: str = "reach", tolerance: float = TOLERANCE, seed: int = 0) -> None:
         self.env = ArmEnv(task, "dense", tolerance=check.scalar("tolerance", tolerance, FINEST, COARSEST))
-        self.task = task
+        self.task = registry.entry(task).name
         self.core = self.env.core
         self.controls = _controls(self.env)
         self.command = np.zeros(len(self.controls))
@@ -128,7 +126,7 @@ class Session:
         self.world = World()
         self.controller = MANUAL
         self._policy: Policy | None = None
-        self._gravity = self.core.load[6:9].copy()
+        self._gravity = self.core.load[loads.GRAVITY].copy()
         self.reset(seed)
 
     def reset(self, seed: int) -> None:
@@ -139,7 +137,7 @@ class Session:
         self.seed = seed
         self.command = np.zeros(len(self.controls))
         self.drive_by(self.controller)
-        self._past: deque[tuple[Array, Array]] = deque(maxlen=round(HISTORY_S / STEP_S) + 1)
+        self._past: deque[tuple[Array, Array]] = deque(maxlen=round(HISTORY_S / self.core.step_s) + 1)
         self._remember()
         self.solve = self._solved(0.0)
 
@@ -151,18 +149,18 @@ class Session:
         ValueError
             If there is no such controller here.
         """
-        if controller not in CONTROLLERS or CONTROLLERS[controller].missing():
-            expected = ", ".join(repr(name) for name, kind in CONTROLLERS.items() if not kind.missing())
-            raise ValueError(f"controller = {controller!r}: expected one of {expected}")
+        there = controllers(self.task)
+        if controller not in there:
+            raise ValueError(f"controller = {controller!r}: expected one of {', '.join(map(repr, there))}")
         # A new one each time: a scripted controller remembers its plans.
         self._policy = CONTROLLERS[controller].load(self.task)
         self.controller = controller
 
     def step(self) -> None:
-        """Let 0.1 s pass."""
+        """Let the time of one step pass."""
         record = self.core.record
         action = self._action() if self._policy is None else self._policy.predict(self.observation, deterministic=True)[0]
-        self.core.load[6:9] = self.world.acceleration(self._gravity)
+        self.core.load[loads.GRAVITY] = self.world.acceleration(self._gravity)
         own = record.payload.copy()
         record.payload[:, 0] += 1e-3 * self.world.payload
         loaded = record.payload.copy()
@@ -181,16 +179,16 @@ class Session:
     @property
     def time(self) -> float:
         """Time since the episode's start [s]."""
-        return STEP_S * float(self.core.record.steps[0])
+        return self.core.step_s * float(self.core.record.steps[0])
 
     def history(self) -> tuple[Array, Array, Array]:
         """Return the last half minute: times (k,) [s], temperatures (k, m) [degC], tensions (k, n) [mN]; now is last."""
-        times = self.time + STEP_S * np.arange(1.0 - len(self._past), 1.0)
+        times = self.time + self.core.step_s * np.arange(1.0 - len(self._past), 1.0)
         return times, np.array([t for t, _ in self._past]), 1e3 * np.array([f for _, f in self._past])
 
     def parts(self) -> dict[str, Part]:
-        """Return what is to be seen, see `geometry.parts`."""
-        return parts(self.env.task, self.core)
+        """Return what is to be seen, see `Task.parts`."""
+        return self.env.task.parts(self.core)
 
     def discretisation(self) -> str:
         """Return how the arm is discretised, in a line."""
@@ -201,37 +199,38 @@ class Session:
         """Return the action (a,) in [-1, 1] for the visitor's command."""
         most = np.array([control.most for control in self.controls])
         action = 2.0 * np.clip(self.command / most, 0.0, 1.0) - 1.0
-        powers = self.core.heating.max_power.size
-        # The action is the stage's speed; a visitor says where it shall be.
-        action[powers:] = 1e-3 * (self.command[powers:] - self._stage()) / (presets.STAGE_SPEED * STEP_S)
+        stage, powers = self.env.task.robot.stage, self.core.heating.max_power.size
+        if stage is not None:  # the action is its speed; a visitor says where it shall be
+            action[powers:] = 1e-3 * (self.command[powers:] - self._stage()) / (stage.speed * self.core.step_s)
         return np.clip(action, -1.0, 1.0)
 
     def _stage(self) -> float:
         """Return how far the stage is lowered [mm]; 0 where there is none."""
-        scene = self.core.record.scene
-        return 1e3 * float(scene[0, grasp.STAGE]) if scene.size else 0.0
+        return 1e3 * self.env.task.posture(self.core.record).lowered
 
     def _remember(self) -> None:
         self._past.append((self.core.record.temperature[0].copy(), self.core.record.tension[0].copy()))
 
     def _solved(self, milliseconds: float) -> Solve:
         told, record = self.info["solver"], self.core.record
-        stability = ladder.smallest_eigenvalue(
-            self.env.arm.model, record.strain[0], record.tension[0].copy(), record.drive[0], record.load[0]
-        )
+        lane = continuation.Lane(record.strain[0], record.tension[0], record.drive[0], record.load[0])
+        stability = continuation.smallest_eigenvalue(self.env.arm.problem, lane)
         return Solve(
             milliseconds, Rung(told["rung"]), told["iterations"], told["residual"], told["converged"], told["jumped"], stability
         )
 
 
 def _controls(env: ArmEnv) -> list[Control]:
-    """Return the controls of an environment: a heating power for each TCA, and the stage."""
-    muscles = env.arm.muscles
+    """Return the controls of an environment: a heating power for each TCA, the stage, and what else a task acts by."""
+    muscles, robot = env.arm.muscles, env.task.robot
     names = [f"Bend {degrees(m.angle):.0f}°" if m.turns == 0.0 else "Twist" for m in muscles]
     powers = env.core.heating.max_power
     names += ["Grip"] * (powers.size - len(muscles))
     result = [Control(name, "W", float(power)) for name, power in zip(names, powers, strict=True)]
-    return result + [Control("Stage", "mm", 1e3 * presets.STAGE_TRAVEL)] * (env.task.actions - powers.size)
+    others = range(powers.size, env.task.actions)
+    if robot.stage is not None:
+        return result + [Control("Stage", "mm", 1e3 * robot.stage.travel)] * len(others)
+    return result + [Control(f"Action {i}", "share", 1.0) for i in others]
 
 
 class Kind(NamedTuple):
@@ -239,49 +238,48 @@ class Kind(NamedTuple):
 
     load: Callable[[str], Policy | None]
     """Task -> one of it."""
-    missing: Callable[[], str]
-    """() -> what is missing to have it here, "" where nothing is."""
+    missing: Callable[[str], str]
+    """Task -> what is missing to have it here, "" where nothing is."""
+
+
+def controllers(task: str) -> tuple[str, ...]:
+    """Return what can drive a task here."""
+    return tuple(name for name, kind in CONTROLLERS.items() if not kind.missing(task))
 
 
 def _scripted(task: str) -> Policy:
-    from agents.scripted import CONTROLLERS as SCRIPTS
+    policy: Policy = registry.load(registry.entry(task).controller)()
+    return policy
 
-    return SCRIPTS[task]()
+
+def _no_script(task: str) -> str:
+    controller = registry.entry(task).controller
+    if controller is None:
+        return "this task has none"
+    # Others have a package `agents`, too.
+    module = controller.partition(":")[0] if isinstance(controller, str) else None
+    there = module is None or (find_spec(module.partition(".")[0]) and find_spec(module))
+    return "" if there else f"needs the package `{str(module).partition('.')[0]}` of a checkout"
 
 
 @cache
 def _pretrained(task: str) -> Policy:
     """Return the policy that comes along for a task; it remembers nothing, so that visitors share it."""
-    from agents.policies import learner
-
-    folder = _pretrained_folder() / task
-    algorithm = json.loads((folder / "policy.json").read_text())["algo"]
-    policy: Policy = learner(algorithm).load(folder / "policy.zip", device="cpu")
+    policy: Policy = registry.load("agents.training:pretrained")(task)
     return policy
 
 
-def _pretrained_folder() -> Path:
-    import agents
-
-    return Path(agents.__path__[0]) / "pretrained"
-
-
-def _no_scripts() -> str:
-    # Others have packages of that name, too.
-    return "" if find_spec("agents") and find_spec("agents.scripted") else "needs the package `agents` of a checkout"
-
-
-def _no_policies() -> str:
-    if _no_scripts():
-        return _no_scripts()
-    if not _pretrained_folder().is_dir():
-        return "needs agents/pretrained of a checkout"
+def _no_policy(task: str) -> str:
+    if not (find_spec("agents") and find_spec("agents.training")):
+        return "needs the package `agents` of a checkout"
+    if not (registry.load("agents.training:PRETRAINED") / task).is_dir():
+        return f"needs agents/pretrained/{task} of a checkout"
     return "" if find_spec("stable_baselines3") else 'needs pip install "tca_envs[train]"'
 
 
 CONTROLLERS = {
-    MANUAL: Kind(lambda task: None, lambda: ""),
-    SCRIPTED: Kind(_scripted, _no_scripts),
-    PRETRAINED: Kind(_pretrained, _no_policies),
+    MANUAL: Kind(lambda task: None, lambda task: ""),
+    SCRIPTED: Kind(_scripted, _no_script),
+    PRETRAINED: Kind(_pretrained, _no_policy),
 }
 """What can drive the arm, by name."""

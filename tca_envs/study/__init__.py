@@ -1,1 +1,0 @@
-"""Studies on the arm that write figures and tables: python -m tca_envs.study --help lists them."""
