@@ -173,7 +173,7 @@ from tca_envs.robots import paper
 from tca_envs.mechanics import Arm
 arm = Arm([paper.bending_module()], paper.GRAVITY, paper.BELOW_BENDING, [(1, 5)], 1e-6)
 state, tips = arm.equilibrium([60.0, 25.0, 25.0]), []
-for drive in ([90.0, 25.0, 25.0], [125.0, 30.0, 25.0], [158.0, 158.0, 39.0]):
+for drive in ([125.0, 30.0, 25.0], [158.0, 158.0, 39.0]):
     state = arm.equilibrium(drive, start=state)
     tips += [*state.tip_pose.ravel(), *state.tensions, *state.tip_jacobian.ravel(), state.stability, state.rung]
 np.savetxt(sys.argv[1], tips)
@@ -188,7 +188,7 @@ def test_without_compiling_the_whole_ladder_runs_in_python(tmp_path):
         env = {**os.environ, "NUMBA_DISABLE_JIT": disabled, "PYTHONPATH": str(PACKAGE.parent)}
         subprocess.run([sys.executable, "-c", INTERPRETED, str(path)], check=True, env=env)
         found.append(np.loadtxt(path))
-    assert found[0].size == 3 * (16 + 3 + 18 + 2)
+    assert found[0].size == 2 * (16 + 3 + 18 + 2)
     np.testing.assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-6)
 
 
