@@ -25,7 +25,7 @@ from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, inf
 from numba.extending import lower_builtin, lower_cast, lower_getattr_generic, register_model
 
 LANES = 1 if config.DISABLE_JIT else 4
-"""Arms in a pack. With 8, where AVX-512 has such registers, batches take a quarter less time and one arm a third more."""
+"""Arms in a pack. With 8, where AVX-512 has such registers, large batches would be faster and one arm slower."""
 _FLOAT, _INDEX = ir.DoubleType(), ir.IntType(32)
 _VECTOR, _FLAGS = ir.VectorType(_FLOAT, LANES), ir.VectorType(ir.IntType(1), LANES)
 
